@@ -11,7 +11,7 @@ use common::scene::{self, Spec};
 use common::{Bench, Contender, Threads, Work, agree, inputs};
 use rayon::prelude::*;
 use subsplat::network::config::{Config, Preset};
-use subsplat::network::model::spgr::rules;
+use subsplat::network::model::spgr_heads::rules;
 use subsplat::network::ops::redistribute::{OpacityRule, redistribute};
 use subsplat::network::ops::spgr::{Spgr, spgr, spgr_into};
 use subsplat_kernels::cpu::{redistribute as shares, spgr as kernel, sums};

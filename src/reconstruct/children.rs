@@ -5,7 +5,7 @@ use super::density::{Density, counts, grids};
 use super::detail::{self, add_detail};
 use super::{Error, Result};
 use crate::finish::{Groups, LEAST_SHARE, TargetView, hidden, shares};
-use crate::network::model::encoding::SceneEncoding;
+use crate::network::model::scene_encoding::SceneEncoding;
 use crate::network::model::subsplat::{SceneOutput, SubSplat};
 use crate::network::model::trace::Checkpoint;
 use crate::reconstruct::inputs::crop::Cropped;

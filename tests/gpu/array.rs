@@ -14,8 +14,8 @@ use subsplat::network::ops::activation::Activation;
 use subsplat::network::ops::attention::Labels;
 use subsplat::network::ops::attributes::Attributes;
 use subsplat::network::ops::plane_sweep::{Sweep, pair, relative_pose};
-use subsplat::network::ops::small::{Candidates, MeanOver, Start};
-use subsplat::network::ops::{Array, ConvSteps, Executor};
+use subsplat::network::ops::small::{Candidates, MeanOver, SmallArray, Start};
+use subsplat::network::ops::{Array, ConvConfig, Executor};
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 use subsplat_kernels::layout::MuInput;
 
@@ -70,26 +70,26 @@ fn elementwise_functions() {
     let (x, y) = (noise(r, &[3, 5, 7, 9]), noise(r, &[3, 5, 7, 9]));
     let (row, map) = (noise(r, &[1, 5, 1, 1]), noise(r, &[3, 1, 7, 9]));
     agree!(gpu, "affine", TOLERANCE, |x| x.affine(-1.5, 0.25));
-    agree!(gpu, "absolute", TOLERANCE, |x| x.absolute());
-    agree!(gpu, "squared", TOLERANCE, |x| x.squared());
-    agree!(gpu, "reciprocal", TOLERANCE, |x| x.reciprocal());
-    agree!(gpu, "clamped", TOLERANCE, |x| x.clamped(-0.5, 1.25));
-    agree!(gpu, "plus", TOLERANCE, |x, y| x.plus(y));
-    agree!(gpu, "plus row", TOLERANCE, |x, row| x.plus(row));
-    agree!(gpu, "plus, relu", TOLERANCE, |x, row| x.plus_then(row, Activation::Relu));
-    agree!(gpu, "minus map", TOLERANCE, |x, map| x.minus(map));
-    agree!(gpu, "times row", TOLERANCE, |x, row| x.times(row));
-    agree!(gpu, "over", TOLERANCE, |x, y| x.over(y));
+    agree!(gpu, "abs", TOLERANCE, |x| Array::abs(x));
+    agree!(gpu, "sqr", TOLERANCE, |x| Array::sqr(x));
+    agree!(gpu, "recip", TOLERANCE, |x| Array::recip(x));
+    agree!(gpu, "clamp", TOLERANCE, |x| Array::clamp(x, -0.5, 1.25));
+    agree!(gpu, "add", TOLERANCE, |x, y| Array::add(x, y));
+    agree!(gpu, "add row", TOLERANCE, |x, row| Array::add(x, row));
+    agree!(gpu, "add, relu", TOLERANCE, |x, row| x.add_activation(row, Activation::Relu));
+    agree!(gpu, "sub map", TOLERANCE, |x, map| Array::sub(x, map));
+    agree!(gpu, "mul row", TOLERANCE, |x, row| Array::mul(x, row));
+    agree!(gpu, "div", TOLERANCE, |x, y| Array::div(x, y));
     for kind in [Activation::Relu, Activation::Silu, Activation::Gelu, Activation::Sigmoid] {
-        agree!(gpu, &format!("{kind:?}"), TOLERANCE, |x| x.affine(4.0, 0.0)?.activated(kind));
+        agree!(gpu, &format!("{kind:?}"), TOLERANCE, |x| x.affine(4.0, 0.0)?.activate(kind));
     }
     let large =
         Tensor::new(&[-200f32, -20.0, -1e-3, 0.0, 1e-3, 20.0, 200.0], &Device::Cpu).unwrap();
     for kind in [Activation::Silu, Activation::Gelu, Activation::Sigmoid] {
-        agree!(gpu, &format!("{kind:?} far out"), TOLERANCE, |large| large.activated(kind));
+        agree!(gpu, &format!("{kind:?} far out"), TOLERANCE, |large| large.activate(kind));
     }
     let nan = Tensor::new(&[f32::NAN, 1.0], &Device::Cpu).unwrap();
-    let clamped = gpu.upload(&nan).unwrap().clamped(0.0, 2.0).unwrap();
+    let clamped = gpu.upload(&nan).unwrap().clamp(0.0, 2.0).unwrap();
     assert!(values(&clamped.to_host().unwrap())[0].is_nan(), "a clamp hides NaN");
 }
 
@@ -109,20 +109,24 @@ fn parts_and_orders() {
         x.narrow(0, 1, 1)?.reshape((24, 8))?.narrow(0, 3, 2)?.affine(2.0, 0.0)
     });
     agree!(gpu, "a shared part is read", COPIED, |x| x.narrow(0, 1, 1));
-    agree!(gpu, "permuted", COPIED, |x| x.permuted(&[2, 0, 3, 1]));
-    agree!(gpu, "selected", COPIED, |x| x.selected(1, &[5, 0, 0, 2]));
-    agree!(gpu, "joined", COPIED, |x, y| Array::joined(&[y, x, y], 1));
-    agree!(gpu, "joined 0", COPIED, |x| Array::joined(&[x, x], 0));
-    agree!(gpu, "repeated", COPIED, |x| x.repeated(3));
-    agree!(gpu, "beside", COPIED, |x, small| x.beside(small, 2));
+    agree!(gpu, "permute", COPIED, |x| Array::permute(x, &[2, 0, 3, 1]));
+    agree!(gpu, "index select", COPIED, |x| Array::index_select(x, &[5, 0, 0, 2], 1));
+    agree!(gpu, "cat", COPIED, |x, y| Array::cat(&[y, x, y], 1));
+    agree!(gpu, "cat 0", COPIED, |x| Array::cat(&[x, x], 0));
+    agree!(gpu, "upsample nearest", COPIED, |x| Array::upsample_nearest2d(x, 3));
+    agree!(gpu, "cat upsampled", COPIED, |x, small| x.cat_upsampled(small, 2));
     agree!(gpu, "channels last", COPIED, |x| x.channels_last());
-    agree!(gpu, "edges", COPIED, |x| x.edges_repeated());
+    for padding in [1, 3] {
+        agree!(gpu, "replication pad", COPIED, |x| x.replication_pad2d(padding));
+    }
     let (a, b, c) = (noise(r, &[7, 2]), noise(r, &[7, 5]), noise(r, &[7, 1]));
-    agree!(gpu, "columns", COPIED, |a, b, c| a.columns(b, Some(c)));
-    agree!(gpu, "pooled", TOLERANCE, |x| x.pooled(2));
-    agree!(gpu, "summed", TOLERANCE, |x| x.summed(1));
-    agree!(gpu, "averaged", TOLERANCE, |x| x.averaged(2));
-    agree!(gpu, "largest", COPIED, |x| x.largest());
+    agree!(gpu, "cat columns", COPIED, |a, b, c| a.cat_columns(b, Some(c)));
+    agree!(gpu, "average pool", TOLERANCE, |x| Array::avg_pool2d(x, 2));
+    agree!(gpu, "sum", TOLERANCE, |x| Array::sum(x, 1));
+    agree!(gpu, "mean", TOLERANCE, |x| Array::mean(x, 2));
+    for dim in [1, 3] {
+        agree!(gpu, "max", COPIED, |x| Array::max_keepdim(x, dim));
+    }
 }
 
 /// (channels, outputs, height, width, kernel, stride, padding): parts of tiles on every side, strides
@@ -142,34 +146,41 @@ fn products() {
     let r = &mut Random(5);
     for (c, o, h, w, k, stride, padding) in CONVOLUTIONS {
         let (x, weight, bias) = (noise(r, &[2, c, h, w]), noise(r, &[o, c, k, k]), noise(r, &[o]));
-        let steps = ConvSteps { stride, padding };
+        let steps = ConvConfig { stride, padding };
         let name = format!("convolution {c} {o} {k}");
-        agree!(gpu, &name, TOLERANCE, |x, weight, bias| x.convolved(
+        agree!(gpu, &name, TOLERANCE, |x, weight, bias| Array::conv2d(
+            x,
             weight,
             Some(bias),
             steps,
             None
         ));
-        agree!(gpu, &name, TOLERANCE, |x, weight| x.convolved(weight, None, steps, None));
+        agree!(gpu, &name, TOLERANCE, |x, weight| Array::conv2d(x, weight, None, steps, None));
         let gelu = Some(Activation::Gelu);
-        agree!(gpu, &name, TOLERANCE, |x, weight| x.convolved(weight, None, steps, gelu));
+        agree!(gpu, &name, TOLERANCE, |x, weight| Array::conv2d(x, weight, None, steps, gelu));
     }
     let (x, weight, bias) =
         (noise(r, &[2, 4, 6, 9, 10]), noise(r, &[3, 4, 3, 3, 3]), noise(r, &[3]));
-    let steps = ConvSteps { stride: 1, padding: 1 };
-    agree!(gpu, "3-D", TOLERANCE, |x, weight, bias| x.convolved(weight, Some(bias), steps, None));
+    let steps = ConvConfig { stride: 1, padding: 1 };
+    agree!(gpu, "3-D", TOLERANCE, |x, weight, bias| Array::conv3d(
+        x,
+        weight,
+        Some(bias),
+        steps,
+        None
+    ));
     for (n, c, o) in [(1, 1, 1), (130, 67, 70), (64, 128, 64), (300, 11, 5)] {
         let (x, weight, bias) = (noise(r, &[n, c]), noise(r, &[o, c]), noise(r, &[o]));
-        agree!(gpu, "linear", TOLERANCE, |x, weight, bias| x.projected(weight, Some(bias), None));
-        agree!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None, None));
+        agree!(gpu, "linear", TOLERANCE, |x, weight, bias| x.linear(weight, Some(bias), None));
+        agree!(gpu, "linear", TOLERANCE, |x, weight| x.linear(weight, None, None));
         let silu = Some(Activation::Silu);
-        agree!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None, silu));
+        agree!(gpu, "linear", TOLERANCE, |x, weight| x.linear(weight, None, silu));
     }
     let (x, weights) = (noise(r, &[2, 30, 13]), noise(r, &[2, 13]));
     agree!(gpu, "weighted sum", TOLERANCE, |x, weights| x.weighted_sum(weights));
     let wrong = gpu.upload(&noise(r, &[4, 5, 3, 3])).unwrap();
     let x = gpu.upload(&noise(r, &[1, 4, 8, 8])).unwrap();
-    let text = x.convolved(&wrong, None, steps, None).unwrap_err().to_string();
+    let text = x.conv2d(&wrong, None, steps, None).unwrap_err().to_string();
     assert!(text.contains("convolution") && text.contains("[4, 5, 3, 3]"), "{text}");
 }
 
@@ -205,7 +216,7 @@ fn norms_and_softmax() {
             x.layer_norm([weight, bias], Some(residual))
         });
         agree!(gpu, "layer norm of a sum", 1e-5, |x, weight, bias, residual| {
-            x.layer_norm_of_sum(residual, [weight, bias])
+            x.add_layer_norm(residual, [weight, bias])
         });
         agree!(gpu, "softmax", TOLERANCE, |x| x.affine(10.0, 0.0)?.softmax());
     }
@@ -217,11 +228,13 @@ fn resizes() {
     let x = noise(&mut Random(7), &[2, 3, 5, 9]);
     for size in [[5, 9], [20, 36], [1, 1], [7, 4], [64, 33]] {
         for activation in [None, Some(Activation::Gelu)] {
-            agree!(gpu, &format!("{size:?}"), TOLERANCE, |x| x.resized(size, activation));
+            agree!(gpu, &format!("{size:?}"), TOLERANCE, |x| Array::upsample_bilinear2d(
+                x, size, activation
+            ));
         }
     }
     let line = noise(&mut Random(8), &[1, 2, 1, 4]);
-    agree!(gpu, "one row", TOLERANCE, |line| line.resized([3, 8], None));
+    agree!(gpu, "one row", TOLERANCE, |line| Array::upsample_bilinear2d(line, [3, 8], None));
 }
 
 #[test]
@@ -309,14 +322,14 @@ fn parts_of_the_small_backbone() {
     let Some(gpu) = executor() else { return };
     let r = &mut Random(11);
     let x = noise(r, &[2, 13, 6, 8]);
-    agree!(gpu, "unit channels", TOLERANCE, |x| x.unit_channels());
+    agree!(gpu, "normalize channels", TOLERANCE, |x| x.normalize_channels());
     for (window, mean) in [(2, MeanOver::Window), (1, MeanOver::All)] {
         agree!(gpu, "expected candidate", 1e-5, |x| Ok(x.expectation(window, mean)?[0].clone()));
         agree!(gpu, "mass", 1e-5, |x| Ok(x.expectation(window, mean)?[1].clone()));
     }
     let scores = noise(r, &[2, 13, 6, 8]);
     let factor = Tensor::new(&[0.7f32], &Device::Cpu).unwrap();
-    agree!(gpu, "lifted", TOLERANCE, |x, scores| x.lifted(scores, &factor));
+    agree!(gpu, "add scores", TOLERANCE, |x, scores| x.add_scores(scores, &factor));
     let (masks, index) = (noise(r, &[2, 144, 6, 8]), noise(r, &[2, 1, 6, 8]));
     let confidence = noise(r, &[2, 1, 6, 8]);
     let start = r.many(144, 0.01, 1.0);
@@ -346,7 +359,7 @@ fn parts_of_the_small_backbone() {
     let ranges = vec![Candidates { low: 0.1, step: 0.2 }, Candidates { low: 0.3, step: 0.1 }];
     let lengths = r.many(2 * 12 * 16, 1.0, 2.0);
     agree!(gpu, "ray distance", TOLERANCE, |fine| {
-        fine.absolute()?.ray_distance(ranges.clone(), lengths.clone())
+        Array::abs(fine)?.ray_distance(ranges.clone(), lengths.clone())
     });
 }
 
@@ -392,9 +405,9 @@ fn parts_of_the_trunk() {
     let places = Tensor::from_vec(r.many(4 * n, -0.2, 1.2), (n, 2, 2), &Device::Cpu).unwrap();
     let z = Tensor::from_vec(r.many(2 * n, -0.2, 3.0), (n, 2), &Device::Cpu).unwrap();
     let maps = Tensor::from_vec(r.many(2 * 6 * 8, 0.5, 3.0), (2, 6, 8), &Device::Cpu).unwrap();
-    agree!(gpu, "occlusion", 2e-5, |places, z, maps| places.occlusion(z, maps));
+    agree!(gpu, "occlusion", 2e-5, |places, z, maps| places.occlusion_gate(z, maps));
     let row = noise(r, &[1, 5]);
-    agree!(gpu, "expanded", COPIED, |row| row.expanded(&[7, 5]));
+    agree!(gpu, "broadcast", COPIED, |row| Array::broadcast_as(row, &[7, 5]));
     let gather = base();
     let maps = noise(r, &[70, gather.stride]);
     let query = noise(r, &[n, gather.query_width()]);

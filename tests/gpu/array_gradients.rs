@@ -15,8 +15,8 @@ use subsplat::network::ops::attention::Labels;
 use subsplat::network::ops::attributes::Attributes;
 use subsplat::network::ops::plane_sweep::{Sweep, pair, relative_pose};
 use subsplat::network::ops::precomputed_gradient::precomputed_gradient;
-use subsplat::network::ops::small::{Candidates, MeanOver, Start};
-use subsplat::network::ops::{Array, ConvSteps, DeviceArray, Executor};
+use subsplat::network::ops::small::{Candidates, MeanOver, SmallArray, Start};
+use subsplat::network::ops::{Array, ConvConfig, Executor, TapeArray};
 use subsplat_kernels::layout::MuInput;
 
 use super::array::{CONVOLUTIONS, cameras, noise, values};
@@ -58,9 +58,9 @@ macro_rules! same_gradients {
             let leaves = [$($gpu.upload(&$x)?.leaf()),+];
             let [$($x),+] = &leaves;
             $(let $c = &$gpu.upload(&$c)?;)*
-            let y: Result<DeviceArray> = $body;
+            let y: Result<TapeArray> = $body;
             let y = y?;
-            assert!(y.is_tracked(), "{}: no tape", $name);
+            assert!(y.track_op(), "{}: no tape", $name);
             let gradient = $gpu.upload(&upstream(y.dims()))?;
             let gradients = $gpu.backward(&[(&y, &gradient)])?;
             for (i, (leaf, expected)) in leaves.iter().zip(&of_tensors).enumerate() {
@@ -82,21 +82,24 @@ fn elementwise_functions() {
     let (x, y) = (noise(r, &[3, 5, 7, 9]), noise(r, &[3, 5, 7, 9]));
     let (row, map) = (noise(r, &[1, 5, 1, 1]), noise(r, &[3, 1, 7, 9]));
     same_gradients!(gpu, "affine", TOLERANCE, |x| x.affine(-1.5, 0.25));
-    same_gradients!(gpu, "absolute", TOLERANCE, |x| x.absolute());
-    same_gradients!(gpu, "squared", TOLERANCE, |x| x.squared());
-    same_gradients!(gpu, "reciprocal", TOLERANCE, |x| x.reciprocal());
-    same_gradients!(gpu, "clamped", TOLERANCE, |x| x.clamped(-0.5, 1.25));
-    same_gradients!(gpu, "where above", TOLERANCE, [map], |x| x.where_above(map, 0.25, 3.0));
-    same_gradients!(gpu, "plus", TOLERANCE, |x, y| x.plus(y));
-    same_gradients!(gpu, "plus row", TOLERANCE, |x, row| x.plus(row));
-    same_gradients!(gpu, "minus map", TOLERANCE, |x, map| x.minus(map));
-    same_gradients!(gpu, "times row", TOLERANCE, |x, row| x.times(row));
-    same_gradients!(gpu, "over", TOLERANCE, |x, y| x.over(y));
-    same_gradients!(gpu, "over map", TOLERANCE, |x, map| x.over(map));
-    same_gradients!(gpu, "used twice", TOLERANCE, |x, y| x.times(x)?.plus(&y.times(x)?));
+    same_gradients!(gpu, "abs", TOLERANCE, |x| Array::abs(x));
+    same_gradients!(gpu, "sqr", TOLERANCE, |x| Array::sqr(x));
+    same_gradients!(gpu, "recip", TOLERANCE, |x| Array::recip(x));
+    same_gradients!(gpu, "clamp", TOLERANCE, |x| Array::clamp(x, -0.5, 1.25));
+    same_gradients!(gpu, "where gt", TOLERANCE, [map], |x| x.where_gt(map, 0.25, 3.0));
+    same_gradients!(gpu, "add", TOLERANCE, |x, y| Array::add(x, y));
+    same_gradients!(gpu, "add row", TOLERANCE, |x, row| Array::add(x, row));
+    same_gradients!(gpu, "sub map", TOLERANCE, |x, map| Array::sub(x, map));
+    same_gradients!(gpu, "mul row", TOLERANCE, |x, row| Array::mul(x, row));
+    same_gradients!(gpu, "div", TOLERANCE, |x, y| Array::div(x, y));
+    same_gradients!(gpu, "div map", TOLERANCE, |x, map| Array::div(x, map));
+    same_gradients!(gpu, "used twice", TOLERANCE, |x, y| Array::add(
+        &Array::mul(x, x)?,
+        &Array::mul(y, x)?
+    ));
     for kind in [Activation::Relu, Activation::Silu, Activation::Gelu, Activation::Sigmoid] {
         let name = format!("{kind:?}");
-        same_gradients!(gpu, &name, TOLERANCE, |x| x.affine(4.0, 0.0)?.activated(kind));
+        same_gradients!(gpu, &name, TOLERANCE, |x| x.affine(4.0, 0.0)?.activate(kind));
     }
     same_gradients!(gpu, "softmax", TOLERANCE, |x| x.affine(3.0, 0.0)?.softmax());
 }
@@ -110,33 +113,45 @@ fn parts_orders_and_sums() {
     same_gradients!(gpu, "reshape", TOLERANCE, |x| x.reshape((12, ())));
     same_gradients!(gpu, "narrow 1", TOLERANCE, |x| x.narrow(1, 2, 3));
     same_gradients!(gpu, "narrow 0", TOLERANCE, |x| x.narrow(0, 1, 1)?.affine(2.0, 0.0));
-    same_gradients!(gpu, "permuted", TOLERANCE, |x| x.permuted(&[2, 0, 3, 1]));
-    same_gradients!(gpu, "selected", TOLERANCE, |x| x.selected(1, &[5, 0, 0, 2, 3, 1, 4]));
-    same_gradients!(gpu, "joined", TOLERANCE, |x, y| Array::joined(&[y, x, y], 1));
-    same_gradients!(gpu, "joined 0", TOLERANCE, |x| Array::joined(&[x, x], 0));
-    same_gradients!(gpu, "repeated", TOLERANCE, |x| x.repeated(3));
-    same_gradients!(gpu, "beside", TOLERANCE, |x, small| x.beside(small, 2));
+    same_gradients!(gpu, "permute", TOLERANCE, |x| Array::permute(x, &[2, 0, 3, 1]));
+    same_gradients!(gpu, "index select", TOLERANCE, |x| Array::index_select(
+        x,
+        &[5, 0, 0, 2, 3, 1, 4],
+        1
+    ));
+    same_gradients!(gpu, "cat", TOLERANCE, |x, y| Array::cat(&[y, x, y], 1));
+    same_gradients!(gpu, "cat 0", TOLERANCE, |x| Array::cat(&[x, x], 0));
+    same_gradients!(gpu, "upsample nearest", TOLERANCE, |x| Array::upsample_nearest2d(x, 3));
+    same_gradients!(gpu, "cat upsampled", TOLERANCE, |x, small| x.cat_upsampled(small, 2));
     same_gradients!(gpu, "channels last", TOLERANCE, |x| x.channels_last());
-    same_gradients!(gpu, "edges", TOLERANCE, |x| x.edges_repeated());
+    same_gradients!(gpu, "replication pad", TOLERANCE, |x| x.replication_pad2d(1));
     let (a, b, c) = (noise(r, &[7, 2]), noise(r, &[7, 5]), noise(r, &[7, 1]));
-    same_gradients!(gpu, "columns", TOLERANCE, |a, b, c| a.columns(b, Some(c)));
-    same_gradients!(gpu, "pooled", TOLERANCE, |x| x.pooled(2));
-    same_gradients!(gpu, "summed", TOLERANCE, |x| x.summed(1));
-    same_gradients!(gpu, "averaged", TOLERANCE, |x| x.averaged(2));
-    same_gradients!(gpu, "largest", TOLERANCE, |x| x.largest());
+    same_gradients!(gpu, "cat columns", TOLERANCE, |a, b, c| a.cat_columns(b, Some(c)));
+    same_gradients!(gpu, "average pool", TOLERANCE, |x| Array::avg_pool2d(x, 2));
+    same_gradients!(gpu, "sum", TOLERANCE, |x| Array::sum(x, 1));
+    same_gradients!(gpu, "mean", TOLERANCE, |x| Array::mean(x, 2));
+    for dim in [1, 3] {
+        same_gradients!(gpu, "max", TOLERANCE, |x| Array::max_keepdim(x, dim));
+    }
     let row = noise(r, &[1, 5]);
-    same_gradients!(gpu, "expanded", TOLERANCE, |row| row.expanded(&[700, 5]));
+    same_gradients!(gpu, "broadcast", TOLERANCE, |row| Array::broadcast_as(row, &[700, 5]));
     let (x, weights) = (noise(r, &[2, 30, 13]), noise(r, &[2, 13]));
     same_gradients!(gpu, "weighted sum", TOLERANCE, |x, weights| x.weighted_sum(weights));
     let x = noise(r, &[2, 3, 5, 9]);
     for size in [[5, 9], [20, 36], [1, 1], [7, 4], [64, 33]] {
         for activation in [None, Some(Activation::Gelu)] {
             let name = format!("resize {size:?}");
-            same_gradients!(gpu, &name, TOLERANCE, |x| x.resized(size, activation));
+            same_gradients!(gpu, &name, TOLERANCE, |x| Array::upsample_bilinear2d(
+                x, size, activation
+            ));
         }
     }
     let line = noise(r, &[1, 2, 1, 4]);
-    same_gradients!(gpu, "one row", TOLERANCE, |line| line.resized([3, 8], None));
+    same_gradients!(gpu, "one row", TOLERANCE, |line| Array::upsample_bilinear2d(
+        line,
+        [3, 8],
+        None
+    ));
 }
 
 #[test]
@@ -145,31 +160,33 @@ fn products() {
     let r = &mut Random(5);
     for (c, o, h, w, k, stride, padding) in CONVOLUTIONS {
         let (x, weight, bias) = (noise(r, &[2, c, h, w]), noise(r, &[o, c, k, k]), noise(r, &[o]));
-        let steps = ConvSteps { stride, padding };
+        let steps = ConvConfig { stride, padding };
         let name = format!("convolution {c} {o} {k}");
         same_gradients!(gpu, &name, TOLERANCE, |x, weight, bias| {
-            x.convolved(weight, Some(bias), steps, None)
+            Array::conv2d(x, weight, Some(bias), steps, None)
         });
     }
     let (x, weight, bias) =
         (noise(r, &[2, 4, 6, 9, 10]), noise(r, &[3, 4, 3, 3, 3]), noise(r, &[3]));
-    let steps = ConvSteps { stride: 1, padding: 1 };
-    same_gradients!(gpu, "3-D", TOLERANCE, |x, weight, bias| x.convolved(
+    let steps = ConvConfig { stride: 1, padding: 1 };
+    same_gradients!(gpu, "3-D", TOLERANCE, |x, weight, bias| Array::conv3d(
+        x,
         weight,
         Some(bias),
         steps,
         None
     ));
-    same_gradients!(gpu, "constant weight", TOLERANCE, [weight], |x| x
-        .convolved(weight, None, steps, None));
+    same_gradients!(gpu, "constant weight", TOLERANCE, [weight], |x| Array::conv2d(
+        x, weight, None, steps, None
+    ));
     for (n, c, o) in [(1, 1, 1), (2200, 67, 70), (64, 128, 64), (300, 11, 5)] {
         let (x, weight, bias) = (noise(r, &[n, c]), noise(r, &[o, c]), noise(r, &[o]));
         same_gradients!(gpu, "linear", TOLERANCE, |x, weight, bias| {
-            x.projected(weight, Some(bias), None)
+            x.linear(weight, Some(bias), None)
         });
-        same_gradients!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None, None));
+        same_gradients!(gpu, "linear", TOLERANCE, |x, weight| x.linear(weight, None, None));
         same_gradients!(gpu, "linear, gelu", TOLERANCE, |x, weight| {
-            x.projected(weight, None, Some(Activation::Gelu))
+            x.linear(weight, None, Some(Activation::Gelu))
         });
     }
 }
@@ -211,7 +228,7 @@ fn norms() {
             x.layer_norm([weight, bias], Some(residual))
         });
         same_gradients!(gpu, "norm of a sum", DIFFERENCES, |x, weight, bias, residual| {
-            x.layer_norm_of_sum(residual, [weight, bias])
+            x.add_layer_norm(residual, [weight, bias])
         });
     }
 }
@@ -285,22 +302,22 @@ fn parts_of_the_small_backbone() {
     let Some(gpu) = executor() else { return };
     let r = &mut Random(11);
     let x = noise(r, &[2, 13, 6, 8]);
-    same_gradients!(gpu, "unit channels", TOLERANCE, |x| x.unit_channels());
+    same_gradients!(gpu, "normalize channels", TOLERANCE, |x| x.normalize_channels());
     for (window, mean) in [(2, MeanOver::Window), (1, MeanOver::All)] {
         same_gradients!(gpu, "expectation", TOLERANCE, |x| {
             let [mean, mass] = x.expectation(window, mean)?;
-            mean.plus(&mass.affine(-7.0, 0.0)?)
+            Array::add(mean, &mass.affine(-7.0, 0.0)?)
         });
     }
     let scores = noise(r, &[2, 13, 6, 8]);
     let factor = Tensor::new(&[0.7f32], &Device::Cpu).unwrap();
-    same_gradients!(gpu, "lifted", TOLERANCE, |x, scores| x.lifted(scores, &factor));
+    same_gradients!(gpu, "add scores", TOLERANCE, |x, scores| x.add_scores(scores, &factor));
     let (masks, index) = (noise(r, &[2, 144, 6, 8]), noise(r, &[2, 1, 6, 8]));
     let confidence = noise(r, &[2, 1, 6, 8]);
     let start = r.many(144, 0.01, 1.0);
     same_gradients!(gpu, "convex upsampling", TOLERANCE, |masks, index, confidence| {
         let [first, second] = masks.upsample_convex([index, confidence], &start)?;
-        first.plus(&second.affine(-3.0, 0.0)?)
+        Array::add(first, &second.affine(-3.0, 0.0)?)
     });
     let (rgb, fine) = (noise(r, &[2, 3, 12, 16]), noise(r, &[2, 1, 12, 16]));
     let logit = noise(r, &[2, 1, 12, 16]);
@@ -315,7 +332,7 @@ fn parts_of_the_small_backbone() {
     };
     same_gradients!(gpu, "head output", TOLERANCE, [rgb], |output, fine| {
         let [raw, opacity] = output.head_output(fine, rgb, start.clone())?;
-        Array::joined(&[&raw.reshape((2, ()))?, &opacity.reshape((2, ()))?], 1)
+        Array::cat(&[&raw.reshape((2, ()))?, &opacity.reshape((2, ()))?], 1)
     });
     let start = Start { colour: None, confident: false, ..start };
     same_gradients!(gpu, "plain opacity", TOLERANCE, [rgb, fine], |output| {
@@ -324,7 +341,7 @@ fn parts_of_the_small_backbone() {
     let ranges = vec![Candidates { low: 0.1, step: 0.2 }, Candidates { low: 0.3, step: 0.1 }];
     let lengths = r.many(2 * 12 * 16, 1.0, 2.0);
     same_gradients!(gpu, "ray distance", TOLERANCE, |fine| {
-        fine.absolute()?.ray_distance(ranges.clone(), lengths.clone())
+        Array::abs(fine)?.ray_distance(ranges.clone(), lengths.clone())
     });
 }
 
@@ -336,10 +353,10 @@ fn a_tracked_tensor_receives_its_gradient() {
         let r = &mut Random(12);
         let (x, scores) = (noise(r, &[2, 13, 6, 8]), noise(r, &[2, 13, 6, 8]));
         let factor = Var::new(&[0.7f32], &Device::Cpu)?;
-        let y = x.lifted(&scores, &factor)?;
+        let y = x.add_scores(&scores, &factor)?;
         let dy = upstream(y.dims());
         let expected = precomputed_gradient(&y, 0.0, values(&dy))?.backward()?;
-        let y = gpu.upload(&x)?.lifted(&gpu.upload(&scores)?, &factor)?;
+        let y = gpu.upload(&x)?.add_scores(&gpu.upload(&scores)?, &factor)?;
         let gradients = gpu.backward(&[(&y, &gpu.upload(&dy)?)])?;
         let [scalar] = &gradients.scalars()?[..] else { panic!("expected one parameter") };
         let got = scalar.backward()?;
@@ -392,8 +409,8 @@ fn parts_of_the_trunk() {
 fn nothing_is_recorded_without_a_leaf() {
     let Some(gpu) = executor() else { return };
     let x = gpu.upload(&noise(&mut Random(14), &[3, 4])).unwrap();
-    assert!(!x.softmax().unwrap().is_tracked());
-    assert!(!x.leaf().detached().softmax().unwrap().is_tracked());
+    assert!(!x.softmax().unwrap().track_op());
+    assert!(!x.leaf().detach().softmax().unwrap().track_op());
 }
 
 /// The same bytes in every pass.
@@ -404,10 +421,10 @@ fn gradients_are_reproducible() {
     let (x, weight) = (noise(r, &[2, 9, 40, 41]), noise(r, &[20, 9, 3, 3]));
     let pass = || -> Result<Vec<u32>> {
         let (x, weight) = (gpu.upload(&x)?.leaf(), gpu.upload(&weight)?.leaf());
-        let y = x.convolved(&weight, None, ConvSteps { stride: 1, padding: 1 }, None)?;
+        let y = x.conv2d(&weight, None, ConvConfig { stride: 1, padding: 1 }, None)?;
         let y = y.instance_norm(Some(Activation::Gelu))?;
         let gradients = gpu.backward(&[(&y, &gpu.upload(&upstream(y.dims()))?)])?;
-        let of = |leaf: &DeviceArray| Ok(values(&gradients.of(leaf).unwrap().to_host()?));
+        let of = |leaf: &TapeArray| Ok(values(&gradients.of(leaf).unwrap().to_host()?));
         let all: Result<Vec<Vec<f32>>> = [&x, &weight].into_iter().map(of).collect();
         Ok(all?.concat().into_iter().map(f32::to_bits).collect())
     };

@@ -9,7 +9,7 @@ use subsplat::network::config::{
 use subsplat::network::model::embed::Embeddings;
 use subsplat::network::model::geometry::{Frames, ParentChunk};
 use subsplat::network::model::weights::Weights;
-use subsplat::network::ops::columns::columns;
+use subsplat::network::ops::cat::cat_columns;
 use subsplat::network::ops::linear::linear;
 use subsplat::network::ops::norm::layer_norm;
 use subsplat_kernels::camera::{Camera, Intrinsics};
@@ -176,9 +176,9 @@ fn columns_are_cat() -> Result<()> {
     // More rows than a task takes.
     let x = [noise(293, 5, 0.71)?, noise(293, 3, 1.3)?, noise(293, 7, 0.37)?];
     let cat = |x: &[Tensor]| Tensor::cat(x, 1);
-    beside(&x, |x| columns(&x[0], &x[1], Some(&x[2])), cat)?;
-    beside(&x[..2], |x| columns(&x[0], &x[1], None), cat)?;
-    assert!(columns(x[0].as_tensor(), noise(294, 3, 1.0)?.as_tensor(), None).is_err());
+    beside(&x, |x| cat_columns(&x[0], &x[1], Some(&x[2])), cat)?;
+    beside(&x[..2], |x| cat_columns(&x[0], &x[1], None), cat)?;
+    assert!(cat_columns(x[0].as_tensor(), noise(294, 3, 1.0)?.as_tensor(), None).is_err());
     Ok(())
 }
 

@@ -14,7 +14,7 @@ use subsplat::network::model::aggregation::Aggregation;
 use subsplat::network::model::embed::{Descriptors, Embeddings};
 use subsplat::network::model::geometry::{Frames, ParentChunk};
 use subsplat::network::model::mlp::Mode;
-use subsplat::network::model::spgr::{Head, rules};
+use subsplat::network::model::spgr_heads::{Head, rules};
 use subsplat::network::model::trunk::{Children, TrainPass, Trunk};
 use subsplat::network::model::{BackboneOutput, Primaries, Views};
 use subsplat::network::ops::spgr::{Spgr, spgr};

@@ -92,9 +92,10 @@ impl Kind {
             }
             Self::Gmdepth => {
                 let whole = ["backbone.backbone.", "backbone.transformer."];
-                match whole.iter().any(|p| plain.starts_with(p)) {
-                    true => format!("{ENCODER}{plain}"),
-                    false => format!("{ENCODER}backbone.{plain}"),
+                if whole.iter().any(|p| plain.starts_with(p)) {
+                    format!("{ENCODER}{plain}")
+                } else {
+                    format!("{ENCODER}backbone.{plain}")
                 }
             }
             Self::Lpips => vgg_name(name).unwrap_or_else(|| name.to_owned()),

@@ -84,7 +84,8 @@ impl Embeddings {
             EmbedMlp::Lite => {
                 let hidden =
                     |(name, n): (&str, usize)| linear(n, LITE_HIDDEN, relu, vb.pp(name).pp("lin0"));
-                let (all, c) = (WIDTHS.len() * LITE_HIDDEN, LITE_HIDDEN_COLOUR);
+                let all = WIDTHS.len() * LITE_HIDDEN;
+                let c = LITE_HIDDEN_COLOUR;
                 Mlps::Lite {
                     geometry: WIDTHS.into_iter().map(hidden).collect::<Result<_>>()?,
                     w_g: linear(all, e, xavier(all, e), vb.pp("w_g"))?,
@@ -105,7 +106,8 @@ impl Embeddings {
     /// # Errors
     /// Those of candle.
     pub fn attributes<A: Array>(&self, parents: &ParentChunk<A>, frames: &Frames) -> Result<A> {
-        let (c, source) = (&self.config, &frames.0[parents.source]);
+        let c = &self.config;
+        let source = &frames.0[parents.source];
         let rules = Attributes {
             frame: match c.anchor_frame {
                 AnchorFrame::World => None,
@@ -140,7 +142,7 @@ impl Embeddings {
                 let mut first = WIDTHS[0].1;
                 for (block, (_, width)) in geometry.iter().zip(WIDTHS).skip(1) {
                     let next = block.forward(&all.narrow(1, first, width)?)?;
-                    sum = sum.plus(&next)?;
+                    sum = sum.add(&next)?;
                     first += width;
                 }
                 Ok(Descriptors {
@@ -163,7 +165,9 @@ impl Embeddings {
 fn side_by_side(layers: &[Linear]) -> Result<Linear> {
     let widths = layers.iter().map(|l| l.weight().dim(1)).collect::<Result<Vec<_>>>()?;
     let all: usize = widths.iter().sum();
-    let (mut weights, mut biases, mut first) = (Vec::new(), Vec::new(), 0);
+    let mut weights = Vec::new();
+    let mut biases = Vec::new();
+    let mut first = 0;
     for (layer, width) in layers.iter().zip(widths) {
         weights.push(layer.weight().pad_with_zeros(1, first, all - first - width)?);
         biases.extend(layer.bias());

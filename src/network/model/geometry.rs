@@ -41,8 +41,8 @@ impl<A: Array> ParentChunk<A> {
     /// # Errors
     /// Shapes do not fit one another.
     pub fn rows(&self) -> Result<A> {
-        let all_but_opacity = self.means.columns(&self.quats_wxyz, Some(&self.scales))?;
-        all_but_opacity.columns(&self.opacities, None)
+        let all_but_opacity = self.means.cat_columns(&self.quats_wxyz, Some(&self.scales))?;
+        all_but_opacity.cat_columns(&self.opacities, None)
     }
 }
 
@@ -59,9 +59,9 @@ pub struct Frame {
     pub quat_from_world: Tensor,
 }
 
-/// x·m of `x` `[n, k]` and `m` `[k, k]`.
-fn times<A: Array>(x: &A, m: &Tensor) -> Result<A> {
-    x.projected(&x.like(&m.t()?.contiguous()?)?, None, None)
+/// Computes x·m of `x` `[n, k]` and `m` `[k, k]`.
+fn matmul<A: Array>(x: &A, m: &Tensor) -> Result<A> {
+    x.linear(&x.upload(&m.t()?.contiguous()?)?, None, None)
 }
 
 impl Frame {
@@ -102,7 +102,7 @@ impl Frame {
     /// # Errors
     /// Another shape.
     pub fn to_camera<A: Array>(&self, means: &A) -> Result<A> {
-        times(&means.minus(&means.like(&self.position)?)?, &self.rotation)
+        matmul(&means.sub(&means.upload(&self.position)?)?, &self.rotation)
     }
 
     /// Maps world quaternions `[n, 4]` wxyz to this camera's frame.
@@ -110,7 +110,7 @@ impl Frame {
     /// # Errors
     /// Another shape.
     pub fn quat_to_camera(&self, quats_wxyz: &Tensor) -> Result<Tensor> {
-        times(quats_wxyz, &self.quat_from_world)
+        matmul(quats_wxyz, &self.quat_from_world)
     }
 }
 
@@ -146,19 +146,19 @@ impl Frames {
         for frame in &self.0 {
             let p = frame.to_camera(&flat)?;
             let z = p.narrow(1, 2, 1)?;
-            let safe = z.clamped(VISIBLE_Z_MIN, f64::INFINITY)?;
+            let safe = z.clamp(VISIBLE_Z_MIN, f64::INFINITY)?;
             let [fx, fy, cx, cy] = frame.camera.intrinsics().normalised().map(f64::from);
-            let u = p.narrow(1, 0, 1)?.over(&safe)?.affine(fx, cx)?;
-            let v = p.narrow(1, 1, 1)?.over(&safe)?.affine(fy, cy)?;
-            let uv = A::joined(&[&u, &v], 1)?;
+            let u = p.narrow(1, 0, 1)?.div(&safe)?.affine(fx, cx)?;
+            let v = p.narrow(1, 1, 1)?.div(&safe)?.affine(fy, cy)?;
+            let uv = A::cat(&[&u, &v], 1)?;
             let uv = match mask {
-                MaskMode::Renorm => uv.where_above(&z, VISIBLE_Z_MIN, BEHIND)?,
-                MaskMode::PgClamp => uv.clamped(0.0, CLAMP_MAX)?,
+                MaskMode::Renorm => uv.where_gt(&z, VISIBLE_Z_MIN, BEHIND)?,
+                MaskMode::PgClamp => uv.clamp(0.0, CLAMP_MAX)?,
             };
             positions.push(uv.reshape((n, 1, m, 2))?);
             depths.push(z.reshape((n, 1, m))?);
         }
-        let joined = |parts: &[A]| A::joined(&parts.iter().collect::<Vec<_>>(), 1);
+        let joined = |parts: &[A]| A::cat(&parts.iter().collect::<Vec<_>>(), 1);
         Ok((joined(&positions)?, joined(&depths)?))
     }
 
@@ -179,9 +179,9 @@ impl Frames {
             let z = frame.to_camera(&means.narrow(0, v * per_view, per_view)?)?.narrow(1, 2, 1)?;
             // The minimum.
             let z = z.reshape((height, width, per_view / (height * width)))?.affine(-1.0, 0.0)?;
-            z.largest()?.affine(-1.0, 0.0)?.reshape((1, height, width))
+            z.max_keepdim(2)?.affine(-1.0, 0.0)?.reshape((1, height, width))
         });
-        A::joined(&maps.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
+        A::cat(&maps.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
     }
 }
 

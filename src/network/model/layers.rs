@@ -2,7 +2,7 @@
 //! gradients.
 
 pub use crate::network::ops::activation::Activation;
-use crate::network::ops::{Array, ConvSteps};
+use crate::network::ops::{Array, ConvConfig};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
 
@@ -128,8 +128,8 @@ impl Conv2d {
     fn apply<A: Array>(&self, x: &A, activation: Option<Activation>) -> Result<A> {
         let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
         let ConvShape { stride, padding, .. } = self.shape;
-        let steps = ConvSteps { stride, padding };
-        x.convolved(&x.parameter(&self.weight)?, bias.as_ref(), steps, activation)
+        let steps = ConvConfig { stride, padding };
+        x.conv2d(&x.parameter(&self.weight)?, bias.as_ref(), steps, activation)
     }
 }
 
@@ -189,7 +189,7 @@ impl Linear {
         }
         let x = x.reshape(((), c))?;
         let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
-        let y = x.projected(&x.parameter(&self.weight)?, bias.as_ref(), None)?;
+        let y = x.linear(&x.parameter(&self.weight)?, bias.as_ref(), None)?;
         if let Some(last) = dims.last_mut() {
             *last = o;
         }
@@ -323,7 +323,7 @@ impl LayerNorm {
     /// # Errors
     /// As [`LayerNorm::forward`]; arrays of different shapes.
     pub fn forward_of_sum<A: Array>(&self, x: &A, other: &A) -> Result<A> {
-        x.layer_norm_of_sum(other, [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?])
+        x.add_layer_norm(other, [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?])
     }
 
     /// Applies [`LayerNorm::forward`], then adds `residual`, in one call.
@@ -340,7 +340,7 @@ impl LayerNorm {
 /// # Errors
 /// `x` is not f32.
 pub fn relu<A: Array>(x: &A) -> Result<A> {
-    x.activated(Activation::Relu)
+    x.activate(Activation::Relu)
 }
 
 /// Computes x·sigmoid(x).
@@ -348,7 +348,7 @@ pub fn relu<A: Array>(x: &A) -> Result<A> {
 /// # Errors
 /// `x` is not f32.
 pub fn silu<A: Array>(x: &A) -> Result<A> {
-    x.activated(Activation::Silu)
+    x.activate(Activation::Silu)
 }
 
 /// Computes x·Φ(x), the exact (erf) form.
@@ -356,7 +356,7 @@ pub fn silu<A: Array>(x: &A) -> Result<A> {
 /// # Errors
 /// `x` is not f32.
 pub fn gelu<A: Array>(x: &A) -> Result<A> {
-    x.activated(Activation::Gelu)
+    x.activate(Activation::Gelu)
 }
 
 /// Computes 1/(1 + e⁻ˣ).
@@ -364,7 +364,7 @@ pub fn gelu<A: Array>(x: &A) -> Result<A> {
 /// # Errors
 /// `x` is not f32.
 pub fn sigmoid<A: Array>(x: &A) -> Result<A> {
-    x.activated(Activation::Sigmoid)
+    x.activate(Activation::Sigmoid)
 }
 
 pub use crate::network::ops::activation::softmax;

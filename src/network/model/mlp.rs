@@ -42,7 +42,7 @@ pub(crate) fn affine_then<A: Array>(layer: &Linear, x: &A, activation: Activatio
 
 fn projected<A: Array>(layer: &Linear, x: &A, activation: Option<Activation>) -> Result<A> {
     let bias = layer.bias().map(|bias| x.parameter(bias)).transpose()?;
-    x.projected(&x.parameter(layer.weight())?, bias.as_ref(), activation)
+    x.linear(&x.parameter(layer.weight())?, bias.as_ref(), activation)
 }
 
 /// (Linear, ReLU, LayerNorm) twice: an attribute MLP of PixelGaussian and

@@ -105,7 +105,8 @@ pub fn primaries(
 /// Those of [`primaries`].
 pub fn packed(out: &BackboneOutput, views: &Views, settings: &Settings) -> Result<Packed> {
     let adapter = adapter_of(out, views, settings)?;
-    let ([h, w], g) = (adapter.size, adapter.per_pixel);
+    let [h, w] = adapter.size;
+    let g = adapter.per_pixel;
     Ok(Packed {
         placed: place(&out.raw, &out.depths, &out.densities, adapter)?,
         scenes: views.scenes(),
@@ -157,7 +158,8 @@ pub fn adapter_of<A: Array>(
 
 /// Constants of one view.
 fn view(camera: &Camera, s: &Settings) -> View {
-    let (k, rotation) = (camera.intrinsics(), camera.rotation().as_dmat3());
+    let k = camera.intrinsics();
+    let rotation = camera.rotation().as_dmat3();
     let pixel = PIXEL_SHARE * (1.0 / f64::from(k.fx) + 1.0 / f64::from(k.fy));
     let d = sh_coefficients(s.sh_degree);
     let basis = match s.sh_frame {
@@ -243,7 +245,8 @@ fn trace_parts(
     let q = out.raw.narrow(3, 5, 4)?;
     let rotations = q.broadcast_div(&(q.sqr()?.sum_keepdim(3)?.sqrt()? + QUAT_EPS)?)?;
     let g = out.depths.dim(3)?;
-    let (n, pixels) = (all.per_view, all.per_view / g);
+    let n = all.per_view;
+    let pixels = all.per_view / g;
     let rotations = rotations.unsqueeze(3)?.broadcast_as((b, v, pixels, g, 4))?;
     let d = sh_coefficients(settings.sh_degree);
     trace.put("gauss.depths", &out.depths.flatten_from(2)?)?;

@@ -4,13 +4,14 @@ use super::backbone::small::{DepthMaps, DisparityMean};
 use super::backbone::{Mvsplat, SmallBackbone};
 use super::half_size_pass;
 use super::primaries::primaries;
-use super::trace::{Checkpoint, Trace};
 #[cfg(feature = "gpu")]
-use super::traced::Tape;
-use super::traced::Traced;
+use super::taped::Tape;
+use super::taped::Taped;
+use super::trace::{Checkpoint, Trace};
 use super::trunk::{Children, Trunk};
 use super::{BackboneOutput, Primaries, Views};
 use crate::network::config::{Backbone, Config, FeatureLevel};
+use crate::network::ops::small::SmallArray;
 use crate::network::ops::{Array, Backend};
 use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
@@ -131,7 +132,7 @@ impl SubSplat {
     }
 
     /// Runs the backbone on the executor of `images`, the views' images.
-    pub(super) fn encode_on<A: Array>(
+    pub(super) fn encode_on<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
@@ -178,7 +179,8 @@ impl SubSplat {
     ) -> Result<Views> {
         match (&self.encoder, &self.config.backbone) {
             (Encoder::Small(network), Backbone::Small(c)) if c.estimate_depth_range => {
-                let (d, stride) = (network.candidates(), self.config.stride());
+                let d = network.candidates();
+                let stride = self.config.stride();
                 half_size_pass::estimate_depth_range(views, d, stride, |views| {
                     self.depth_indices(network, views, &Trace::with_checkpoint(checkpoint))
                 })
@@ -214,7 +216,7 @@ impl SubSplat {
         &self,
         views: &Views,
         mean: DisparityMean,
-    ) -> Result<Traced<(BackboneOutput, Option<DepthMaps>)>> {
+    ) -> Result<Taped<(BackboneOutput, Option<DepthMaps>)>> {
         #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
@@ -225,15 +227,15 @@ impl SubSplat {
             let mut tape = Tape::new(executor);
             let output = output.copied(&mut tape)?;
             let maps = maps.map(|maps| maps.copied(&mut tape)).transpose()?;
-            Ok(Traced::on_device((output, maps), tape))
+            Ok(Taped::on_device((output, maps), tape))
         }) {
             return result;
         }
-        Ok(Traced::on_host(self.train_on(views, &views.images, mean)?))
+        Ok(Taped::on_host(self.train_on(views, &views.images, mean)?))
     }
 
     /// Runs the backbone for training on the executor of `images`, the views' images.
-    fn train_on<A: Array>(
+    fn train_on<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
@@ -254,7 +256,7 @@ impl SubSplat {
     ///
     /// # Errors
     /// The backbone is MVSplat's; a side is not a multiple of [`Config::stride`].
-    pub fn depth_maps(&self, views: &Views, mean: DisparityMean) -> Result<Traced<DepthMaps>> {
+    pub fn depth_maps(&self, views: &Views, mean: DisparityMean) -> Result<Taped<DepthMaps>> {
         let Encoder::Small(encoder) = &self.encoder else {
             bail!("depth maps: expected the small backbone, got MVSplat's")
         };
@@ -264,11 +266,11 @@ impl SubSplat {
             let maps = encoder.depth_on(views, &images, mean, &Trace::off())?;
             let mut tape = Tape::new(executor);
             let maps = maps.copied(&mut tape)?;
-            Ok(Traced::on_device(maps, tape))
+            Ok(Taped::on_device(maps, tape))
         }) {
             return result;
         }
-        Ok(Traced::on_host(encoder.depth(views, mean)?))
+        Ok(Taped::on_host(encoder.depth(views, mean)?))
     }
 
     /// Returns the world-frame primaries of the backbone's `output`.

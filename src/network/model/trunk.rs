@@ -4,31 +4,31 @@
 //!
 //! Parameters under `subsplat`: `embed`, `agg`, `geo`, `app`; none with SPGR off.
 
-mod children;
-mod initial;
-mod mixed;
+mod initial_values;
+mod mixed_counts;
 #[cfg(feature = "gpu")]
 mod on_device;
 mod recompute;
+mod scene_gaussians;
 
-pub use children::Children;
-pub use initial::{initial_value, set_initial_values};
-pub use mixed::MixedChildren;
+pub use initial_values::{initial_value, set_initial_values};
+pub use mixed_counts::MixedChildren;
 #[cfg(feature = "gpu")]
 pub(super) use on_device::DeviceParents;
 pub use recompute::Recomputed;
+pub use scene_gaussians::Children;
 
 use super::aggregation::{Aggregation, Prepared};
 use super::embed::{Descriptors, Embeddings};
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
-use super::spgr::{Heads, rules};
+use super::spgr_heads::{Heads, rules};
 use super::trace::Checkpoint;
 use super::{BackboneOutput, Primaries, Views};
 use crate::network::config::{Config, FeatureLevel, ShInput, SpgrHead};
 #[cfg(feature = "gpu")]
 use crate::network::ops::Executor;
-use crate::network::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
+use crate::network::ops::direct_rendering::{Footprint, rasterize_footprints, spgr_footprints};
 use crate::network::ops::spgr::{Rules, Spgr, spgr_on};
 use crate::network::ops::{Array, Backend, rasterize_on};
 use candle_core::{DType, Device, Result, Tensor, bail};
@@ -164,9 +164,10 @@ impl Trunk {
             let dim = config.embed.dim;
             Some(Parts {
                 embeddings: Embeddings::new(&config.embed, sh, vb.pp("embed"))?,
-                aggregation: match config.agg.enabled {
-                    true => Some(Aggregation::new(&config.agg, dim, channels, vb.pp("agg"))?),
-                    false => None,
+                aggregation: if config.agg.enabled {
+                    Some(Aggregation::new(&config.agg, dim, channels, vb.pp("agg"))?)
+                } else {
+                    None
                 },
                 heads: Heads::new(config, vb)?,
             })
@@ -249,9 +250,10 @@ impl Trunk {
     /// the `configured` one.
     fn check_served(&self, what: &str, got: usize, configured: usize, most: usize) -> Result<()> {
         let head = self.config.spgr.head;
-        let served = match self.parts.is_some() && !head.serves_any_k() {
-            true => configured..=configured,
-            false => 1..=most,
+        let served = if self.parts.is_some() && !head.serves_any_k() {
+            configured..=configured
+        } else {
+            1..=most
         };
         if served.contains(&got) {
             return Ok(());
@@ -366,9 +368,10 @@ impl Trunk {
             head.write_children(&parents, &scene.call(span), &self.backend, rows, gains)?;
             (how.checkpoint)()
         };
-        match self.backend.is_cpu() {
-            true => jobs.into_par_iter().try_for_each(run)?,
-            false => jobs.into_iter().try_for_each(run)?,
+        if self.backend.is_cpu() {
+            jobs.into_par_iter().try_for_each(run)?
+        } else {
+            jobs.into_iter().try_for_each(run)?
         }
         let device = sh.device();
         let gain = Tensor::from_vec(gains, n * k * lanes, device)?;
@@ -406,7 +409,8 @@ impl Trunk {
             }
         };
         let scene = self.scene(parts, views, backbone, primaries)?;
-        let (k, n) = (scene.rules.children(), scene.means.dim(0)?);
+        let k = scene.rules.children();
+        let n = scene.means.dim(0)?;
         let sh = primaries.sh.squeeze(0)?;
         let fill = |mut left: &mut [Footprint]| {
             let mut jobs = Vec::new();

@@ -24,9 +24,9 @@ pub struct Placed {
     slots: Slots,
 }
 
-/// Gradients of the two SH ([`Frame`]) on their way to the op that made the rows: an op
-/// has one result, so SH hangs on the rows, goes backward first, and leaves its
-/// gradient here.
+/// Gradients of the two SH ([`Frame`]). candle's operations have one result each. The input of the SH
+/// operation is the rows, so its backward pass runs first. It stores its gradient here for the
+/// backward pass of the rows.
 type Slots = Arc<Mutex<[Option<Tensor>; 2]>>;
 
 /// Gaussians of `raw` `[…, H·W, 9 + 3·D]`, `depths` and `densities` `[…, H·W, G]`, the
@@ -40,8 +40,10 @@ pub fn place(
     densities: &Tensor,
     adapter: Adapter,
 ) -> Result<Placed> {
-    let (v, [h, w]) = (adapter.views.len(), adapter.size);
-    let (lanes, g) = (adapter.raw_lanes(), adapter.per_pixel);
+    let v = adapter.views.len();
+    let [h, w] = adapter.size;
+    let lanes = adapter.raw_lanes();
+    let g = adapter.per_pixel;
     for (what, x, last) in [("raw", raw, lanes), ("depths", depths, g), ("densities", densities, g)]
     {
         let fits = x.dims().ends_with(&[h * w, last]) && x.elem_count() == v * h * w * last;
@@ -52,7 +54,9 @@ pub fn place(
     if ![1, 4, 9, 16, 25].contains(&adapter.functions) {
         bail!("{NAME}: expected 1, 4, 9, 16 or 25 SH functions, got {}", adapter.functions);
     }
-    let (raw, adapter, slots) = (raw.contiguous()?, Arc::new(adapter), Slots::default());
+    let raw = raw.contiguous()?;
+    let adapter = Arc::new(adapter);
+    let slots = Slots::default();
     let op = Rows { adapter: adapter.clone(), slots: slots.clone() };
     let rows = raw.apply_op3(&depths.contiguous()?, &densities.contiguous()?, op)?;
     Ok(Placed { rows, raw: raw.detach(), adapter, slots })

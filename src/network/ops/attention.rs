@@ -21,7 +21,9 @@ pub fn attention(
     scale: f32,
     labels: Option<Labels>,
 ) -> Result<Tensor> {
-    let ((r, l, d), (kr, m, kd), (vr, vm, e)) = (q.dims3()?, k.dims3()?, v.dims3()?);
+    let (r, l, d) = q.dims3()?;
+    let (kr, m, kd) = k.dims3()?;
+    let (vr, vm, e) = v.dims3()?;
     if kr != r || vr != r || kd != d || vm != m || m == 0 {
         bail!(
             "attention: expected q [R, L, d], k [R, M, d], v [R, M, e], got {:?}, {:?}, {:?}",

@@ -220,9 +220,10 @@ fn gradients_on_gpu(
     })?;
     let Some(d) = done else { return Ok(None) };
     let device = maps.device();
-    let points = match gather.point_gradient {
-        true => Some(Tensor::from_vec(d.points, points.dims(), device)?),
-        false => None,
+    let points = if gather.point_gradient {
+        Some(Tensor::from_vec(d.points, points.dims(), device)?)
+    } else {
+        None
     };
     Ok(Some((
         Some(Tensor::from_vec(d.maps, maps.dims(), device)?),
@@ -246,9 +247,10 @@ fn defer(
         (part, d_query, d_points)
     })?;
     deferred.0.lock().unwrap_or_else(PoisonError::into_inner).push(part);
-    let points = match g.point_gradient {
-        true => Some(Tensor::from_vec(d_points, points.dims(), device)?),
-        false => None,
+    let points = if g.point_gradient {
+        Some(Tensor::from_vec(d_points, points.dims(), device)?)
+    } else {
+        None
     };
     Ok((None, Some(Tensor::from_vec(d_query, query.dims(), device)?), points))
 }
@@ -261,9 +263,10 @@ fn backward<T: Number>(g: &Gather, [maps, query, points, grad]: [&Tensor; 4]) ->
     let d = borrowed::<T, _, 4>(NAME, [maps, query, points, &grad], |[m, q, p, o]| {
         cpu::backward(g, m, q, p, o)
     })?;
-    let points = match g.point_gradient {
-        true => Some(Tensor::from_vec(d.points, points.dims(), device)?),
-        false => None,
+    let points = if g.point_gradient {
+        Some(Tensor::from_vec(d.points, points.dims(), device)?)
+    } else {
+        None
     };
     Ok((
         Some(Tensor::from_vec(d.maps, maps.dims(), device)?),

@@ -21,7 +21,9 @@ pub(super) fn apply(
     sizes: Sizes,
 ) -> Result<Tensor> {
     let conv = Conv { name, sizes };
-    let (x, weight, o) = (x.contiguous()?, weight.contiguous()?, sizes.out_channels);
+    let x = x.contiguous()?;
+    let weight = weight.contiguous()?;
+    let o = sizes.out_channels;
     match bias {
         Some(bias) if bias.dims() == [o] => x.apply_op3(&weight, &bias.contiguous()?, conv),
         Some(bias) => bail!("{name} bias: expected [{o}], got {:?}", bias.dims()),
@@ -65,14 +67,9 @@ impl Conv {
         w: &Tensor,
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let dx = match x.track_op() {
-            true => Some(dy.apply_op2_no_bwd(w, &InputGrad(*self))?),
-            false => None,
-        };
-        let dw = match w.track_op() {
-            true => Some(x.apply_op2_no_bwd(dy, &WeightGrad(*self))?),
-            false => None,
-        };
+        let dx = if x.track_op() { Some(dy.apply_op2_no_bwd(w, &InputGrad(*self))?) } else { None };
+        let dw =
+            if w.track_op() { Some(x.apply_op2_no_bwd(dy, &WeightGrad(*self))?) } else { None };
         Ok((dx, dw))
     }
 }
@@ -135,10 +132,7 @@ impl CustomOp3 for Conv {
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let dy = dy.contiguous()?;
         let (dx, dw) = self.grads(x, w, &dy)?;
-        let db = match bias.track_op() {
-            true => Some(dy.apply_op1_no_bwd(&BiasGrad(*self))?),
-            false => None,
-        };
+        let db = if bias.track_op() { Some(dy.apply_op1_no_bwd(&BiasGrad(*self))?) } else { None };
         Ok((dx, dw, db))
     }
 }

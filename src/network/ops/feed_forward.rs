@@ -22,7 +22,8 @@ pub fn feed_forward(
     [up, down]: [&Tensor; 2],
     norm: [&Tensor; 2],
 ) -> Result<Tensor> {
-    let ((_, c), (h, both)) = (x.dims2()?, up.dims2()?);
+    let (_, c) = x.dims2()?;
+    let (h, both) = up.dims2()?;
     let fits = message.dims() == x.dims()
         && both == 2 * c
         && down.dims() == [c, h]

@@ -62,7 +62,8 @@ impl CustomOp2 for Linear {
     ) -> Result<(CpuStorage, candle_core::Shape)> {
         let x = slice::<f32>(NAME, "x", s1, l1)?;
         let w = slice::<f32>(NAME, "weight", s2, l2)?;
-        let ((n, c), o) = (l1.shape().dims2()?, l2.dims()[0]);
+        let (n, c) = l1.shape().dims2()?;
+        let o = l2.dims()[0];
         output(forward(x, w, None, [n, c, o]), (n, o))
     }
 

@@ -1,26 +1,28 @@
-//! Custom candle ops over the kernels of [`subsplat_kernels::cpu`]: shape, dtype and layout
-//! checks live here, the arithmetic there. Every op either has a gradient or is
-//! documented to have none; no op drops a gradient silently.
+//! Custom candle ops over the kernels of [`subsplat_kernels::cpu`].
+//!
+//! The ops check shapes, dtypes and layouts; the kernels compute. Every op either has a gradient or
+//! is documented to have none; no op drops a gradient silently. [`Array`] unites the operations that
+//! the network uses; `executor` implements them on a GPU.
 
 pub mod activation;
 pub mod adapter;
+pub mod add;
 pub mod array;
 pub mod attention;
 pub mod attention_gather;
 pub mod attributes;
 mod backend;
-pub mod columns;
+pub mod cat;
+pub mod channels_last;
 mod conv;
 pub mod conv2d;
 pub mod conv3d;
+pub mod direct_rendering;
 #[cfg(feature = "gpu")]
-pub mod device_array;
-pub mod direct;
+pub mod executor;
 pub mod feed_forward;
-pub mod join;
 pub mod linear;
 pub mod matching;
-pub mod moves;
 pub mod norm;
 pub mod plane_sweep;
 pub mod precomputed_gradient;
@@ -31,12 +33,12 @@ pub mod small;
 pub mod spgr;
 mod splat_tensors;
 
-pub use array::{Array, ConvSteps};
+pub use array::{Array, ConvConfig};
 pub use backend::{Backend, NoDevice};
 #[cfg(feature = "gpu")]
-pub use device_array::{
-    ColourLayout, DeviceAdam, DeviceArray, DeviceGradients, DeviceSplats, Executor, ParameterStep,
-    SharedStep,
+pub use executor::{
+    ColourLayout, DeviceAdam, DeviceGradients, DeviceSplats, Executor, ParameterStep, SharedStep,
+    TapeArray,
 };
 #[cfg(feature = "gpu")]
 pub(crate) use rasterize::check_options as check_raster_options;
@@ -51,7 +53,7 @@ pub(crate) trait Number: Real + WithDType {}
 impl Number for f32 {}
 impl Number for f64 {}
 
-/// The elements of an op's argument, which must be contiguous and of type `T`.
+/// Returns the elements of an op's argument, which must be contiguous and of type `T`.
 pub(crate) fn slice<'a, T: Number>(
     op: &str,
     what: &str,
@@ -70,12 +72,12 @@ pub(crate) fn slice<'a, T: Number>(
     }
 }
 
-/// All elements in row-major order, for a kernel of a backward pass.
+/// Returns all elements in row-major order, for a kernel of a backward pass.
 pub(crate) fn elements<T: Number>(tensor: &Tensor) -> Result<Vec<T>> {
     tensor.flatten_all()?.to_vec1::<T>()
 }
 
-/// `f` of the elements of contiguous tensors on the CPU, read where they lie.
+/// Applies `f` to the elements of contiguous tensors on the CPU, without a copy.
 pub(crate) fn borrowed<T: Number, R, const N: usize>(
     op: &str,
     tensors: [&Tensor; N],
@@ -90,12 +92,12 @@ pub(crate) fn borrowed<T: Number, R, const N: usize>(
     Ok(f(slices))
 }
 
-/// An op's result.
+/// Returns an op's result.
 pub(crate) fn output(data: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
     Ok((CpuStorage::F32(data), shape.into()))
 }
 
-/// A tensor of `like`'s shape and device.
+/// Returns a tensor of `like`'s shape and device.
 pub(crate) fn tensor_like(data: Vec<f32>, like: &Tensor) -> Result<Tensor> {
     Tensor::from_vec(data, like.shape(), like.device())
 }

@@ -63,7 +63,8 @@ pub fn plane_sweep_on(
     source: &Tensor,
     sweep: Sweep,
 ) -> Result<Tensor> {
-    let ((r, c, h, w), (s, ..)) = (reference.dims4()?, source.dims4()?);
+    let (r, c, h, w) = reference.dims4()?;
+    let (s, ..) = source.dims4()?;
     if source.dims()[1..] != [c, h, w] || sweep.channels != c || sweep.size != [h, w] {
         bail!(
             "plane sweep: expected reference and source [.., {}, {}, {}], got {:?} and {:?}",
@@ -97,7 +98,9 @@ pub fn plane_sweep_on(
 /// # Errors
 /// candle's error of the allocation.
 pub fn validity(sweep: &Sweep) -> Result<Tensor> {
-    let ([h, w], r, d) = (sweep.size, sweep.pairs.len(), sweep.candidates());
+    let [h, w] = sweep.size;
+    let r = sweep.pairs.len();
+    let d = sweep.candidates();
     let mut out = zeros(r * d * h * w);
     cpu::validity(sweep, &mut out);
     Tensor::from_vec(out, (r, d, h, w), &candle_core::Device::Cpu)
@@ -109,7 +112,9 @@ pub fn validity(sweep: &Sweep) -> Result<Tensor> {
 /// # Errors
 /// A candidate or pair out of range.
 pub fn warped(source: &Tensor, sweep: &Sweep, pair: usize, candidates: &[usize]) -> Result<Tensor> {
-    let ([h, w], c, r) = (sweep.size, sweep.channels, sweep.pairs.len());
+    let [h, w] = sweep.size;
+    let c = sweep.channels;
+    let r = sweep.pairs.len();
     if candidates.iter().any(|&k| k >= sweep.candidates()) {
         bail!("plane sweep: expected candidates below {}, got {candidates:?}", sweep.candidates());
     }
@@ -153,7 +158,9 @@ impl CustomOp2 for Op {
     ) -> Result<(CpuStorage, Shape)> {
         let reference = slice::<f32>("plane-sweep", "reference", s1, l1)?;
         let source = slice::<f32>("plane-sweep", "source", s2, l2)?;
-        let ([h, w], r, d) = (self.0.size, l1.dims()[0], self.0.candidates());
+        let [h, w] = self.0.size;
+        let r = l1.dims()[0];
+        let d = self.0.candidates();
         #[cfg(feature = "gpu")]
         {
             let args = subsplat_kernels::gpu::PlaneSweepArgs { sweep: &self.0, reference, source };

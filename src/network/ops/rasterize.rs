@@ -2,7 +2,7 @@
 //!
 //! In: `splats[N, 11]`, `sh[P, D, 3]` (splat i reads set i / (N/P)), `gain[N]` or
 //! `[N, 4]`, all f32, contiguous, on the CPU. Out: `[5, H, W]`: RGB over the
-//! background, accumulated alpha, Σ w·z. The camera and the options ride in the op.
+//! background, accumulated alpha, Σ w·z. The camera and the options are fields of the op.
 //! Gradients reach all three inputs, exact for the piecewise function that the forward
 //! is ([`subsplat_kernels::cpu::Gradients`]); the background's goes through [`over_background`].
 //! Until its graph is dropped, an op keeps its lists (about 150 bytes a splat), so that
@@ -64,7 +64,8 @@ pub fn rasterize_on(
 ) -> Result<Tensor> {
     check_shapes(splats, sh, gain)?;
     check_options(options)?;
-    let (backend, left) = (backend.clone(), Mutex::default());
+    let backend = backend.clone();
+    let left = Mutex::default();
     let op = Rasterize { camera: *camera, options: *options, backend, left };
     splats.apply_op3(sh, gain, op)
 }
@@ -117,7 +118,7 @@ pub fn rasterize_splats(
 
 /// Puts planes `[5, H, W]` that were rendered over black before a `background` `[3]`:
 /// RGB + (1 − alpha)·background, with gradients to both. For a background that is
-/// learnt or sampled anew; a fixed one rides in [`RasterOptions`].
+/// learnt or sampled anew; a fixed one is a field of [`RasterOptions`].
 ///
 /// # Errors
 /// Tensors of other shapes.
@@ -204,7 +205,9 @@ impl Rasterize {
 
     fn gradients(&self, splats: &SplatSlices, gradient: &[f32]) -> Gradients {
         let mut left = self.left.lock().unwrap_or_else(PoisonError::into_inner);
-        let (mut out, camera, options) = (Gradients::default(), &self.camera, &self.options);
+        let mut out = Gradients::default();
+        let camera = &self.camera;
+        let options = &self.options;
         #[cfg(feature = "gpu")]
         if let Some(frame) = &mut left.frame {
             return self.backend.offload(|_| frame.backward(gradient)).unwrap_or_else(|| {

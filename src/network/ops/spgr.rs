@@ -90,13 +90,14 @@ pub fn spgr_on(
     let made = Made::default();
     let children = Children(call.clone(), made.clone(), backend.clone());
     let rows = head.apply_op2(&parents, children)?;
-    let (count, backend) = (n * call.rules.children(), backend.clone());
+    let count = n * call.rules.children();
+    let backend = backend.clone();
     let gains = head.apply_op1(Gains { rules: call.rules, count, made, backend })?;
     Ok((rows, gains))
 }
 
-/// Gains on their way from [`Children`], whose pass makes both, to [`Gains`]: two ops,
-/// because the gradient of a part of one packed result is a padded copy of the whole.
+/// Gains that [`Children`], whose forward pass computes both results, stores for [`Gains`]. They are
+/// two ops because the gradient of a part of one packed result is a padded copy of the whole.
 type Made = Arc<Mutex<Option<CpuStorage>>>;
 
 /// [`spgr`] of `f32` tensors into `rows` (N·K·11 floats) and `gains` (N·K or N·K·4).
@@ -160,10 +161,7 @@ fn run<T: Number>(
     gains: &mut [T],
 ) -> Result<()> {
     let args = cpu::Args { rules: &call.rules, source: call.source(), head, parents };
-    match cpu::forward(args, rows, gains) {
-        true => Ok(()),
-        false => finite(call, head, parents, rows, gains),
-    }
+    if cpu::forward(args, rows, gains) { Ok(()) } else { finite(call, head, parents, rows, gains) }
 }
 
 /// Refuses numbers that are not finite, on the way in (an infinite opacity would be

@@ -1,10 +1,10 @@
 //! Ops of the small backbone, against tensor operations.
 
 use candle_core::{D, Result, Tensor, Var};
-use subsplat::network::ops::join::join;
+use subsplat::network::ops::cat::cat_upsampled;
 use subsplat::network::ops::small::{
-    Candidates, MeanOver, Start, expectation, head_input, head_output, lift, ray_distance,
-    unit_channels, upsample_convex,
+    Candidates, MeanOver, Start, add_scores, expectation, head_input, head_output,
+    normalize_channels, ray_distance, upsample_convex,
 };
 use subsplat_test_support::same::{far, gradient, noise, same};
 
@@ -15,17 +15,17 @@ fn nearest(x: &Tensor, s: usize) -> Result<Tensor> {
 }
 
 #[test]
-fn joins_are_concatenations() -> Result<()> {
+fn channels_are_concatenated() -> Result<()> {
     for s in [1, 2, 3] {
         let inputs = [noise(&[2, 3, 6, 18], 1)?, noise(&[2, 5, 6 / s, 18 / s], 2)?];
         same(
             &inputs,
-            |x| Ok(vec![join(&x[0], &x[1], s)?]),
+            |x| Ok(vec![cat_upsampled(&x[0], &x[1], s)?]),
             |x| Ok(vec![Tensor::cat(&[&x[0], &nearest(&x[1], s)?], 1)?]),
         )?;
     }
     let x = noise(&[2, 3, 6, 4], 1)?;
-    assert!(join(&x, &x, 2).is_err());
+    assert!(cat_upsampled(&x, &x, 2).is_err());
     Ok(())
 }
 
@@ -58,11 +58,11 @@ fn expectations_agree_with_the_definition() -> Result<()> {
 }
 
 #[test]
-fn lifted_logits_agree_with_the_definition() -> Result<()> {
+fn added_scores_agree_with_the_definition() -> Result<()> {
     let inputs = [noise(&[2, 3, 90, 61], 4)?, noise(&[2, 3, 90, 61], 5)?, noise(&[1], 6)?];
     same(
         &inputs,
-        |x| Ok(vec![lift(&x[0], &x[1], &x[2])?]),
+        |x| Ok(vec![add_scores(&x[0], &x[1], &x[2])?]),
         |x| Ok(vec![(&x[0] + (&x[1] * 4.0)?.broadcast_mul(&x[2])?)?]),
     )
 }
@@ -181,10 +181,10 @@ fn distances_agree_with_the_definition() -> Result<()> {
 }
 
 #[test]
-fn unit_channels_agree_with_the_definition() -> Result<()> {
+fn normalize_channels_agree_with_the_definition() -> Result<()> {
     same(
         &[noise(&[2, 5, 17, 19], 18)?],
-        |x| Ok(vec![unit_channels(&x[0])?]),
+        |x| Ok(vec![normalize_channels(&x[0])?]),
         |x| Ok(vec![x[0].broadcast_div(&(x[0].sqr()?.sum_keepdim(1)? + 1e-8)?.sqrt()?)?]),
     )
 }

@@ -5,7 +5,7 @@ use crate::scenes::{LocalPrimaries, Random, cameras};
 use candle_core::{DType, Tensor};
 use subsplat::network::config;
 use subsplat::network::config::*;
-use subsplat::network::model::spgr::rules;
+use subsplat::network::model::spgr_heads::rules;
 use subsplat::network::ops::spgr::Spgr;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::HEAD_STRIDE;

@@ -174,7 +174,8 @@ pub fn views(tensors: &BTreeMap<String, Tensor>) -> Result<Views> {
     let images = input("in.image")?;
     let (b, v, _, h, w) = images.dims5()?;
     let numbers = |name: &str, rest: &[usize]| -> Result<Vec<f32>> {
-        let (t, expected) = (input(name)?, [&[b, v], rest].concat());
+        let t = input(name)?;
+        let expected = [&[b, v], rest].concat();
         if t.dims() != expected {
             bail!("reference file `{name}`: expected shape {expected:?}, got {:?}", t.dims());
         }

@@ -5,7 +5,7 @@
 //! that the memory in use is that of the arrays alive and of one group. Arrays are contiguous;
 //! [`DeviceArray::reshape`] and whole leading parts share memory.
 //!
-//! Gradients (`*_backward`) are operations too; `subsplat::network::ops::DeviceArray` has the tape that calls them.
+//! Gradients (`*_backward`) are operations too; `subsplat::network::ops::TapeArray` has the tape that calls them.
 //!
 //! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs,
 //! tests/gpu/array_gradients.rs.

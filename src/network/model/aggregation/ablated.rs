@@ -17,9 +17,9 @@ use crate::network::model::geometry::{Frames, ParentChunk};
 use crate::network::model::layers::{LayerNorm, xavier};
 use crate::network::model::mlp::{Mode, affine, linear};
 use crate::network::ops::Backend;
+use crate::network::ops::add::add;
 use crate::network::ops::attention_gather::{Drop, Gather, attention_gather_deferred};
-use crate::network::ops::columns::columns;
-use crate::network::ops::moves;
+use crate::network::ops::cat::{cat_columns, cat_rows};
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
@@ -186,7 +186,8 @@ struct Stage {
 
 impl Stage {
     fn new(keys: &Keys, dim: usize, widths: &[usize], vb: VarBuilder) -> Result<Self> {
-        let (gate_views, pre_norm) = (keys.gate_views, keys.norm == StageNorm::Pre);
+        let gate_views = keys.gate_views;
+        let pre_norm = keys.norm == StageNorm::Pre;
         let keys = &keys.ablations;
         let zero = Init::Const(0.0);
         let levels = widths.len();
@@ -194,9 +195,8 @@ impl Stage {
         let samples = gate_views * levels * points_per_sample(keys);
         let joined = if keys.residual == Residual::Cat { 2 * dim } else { dim };
         let beta = || vb.get_with_hints(gate_views, "gate", zero);
-        let projections = |wanted: bool, name: &str| match wanted {
-            true => per_level(dim, widths, vb.pp(name)),
-            false => Ok(Vec::new()),
+        let projections = |wanted: bool, name: &str| {
+            if wanted { per_level(dim, widths, vb.pp(name)) } else { Ok(Vec::new()) }
         };
         Ok(Self {
             norm: when(pre_norm, || LayerNorm::new(dim, vb.pp("norm")))?,
@@ -233,7 +233,7 @@ impl Stage {
                 (None, None) => map.clone(),
             });
         }
-        moves::stacked(&levels)
+        cat_rows(&levels)
     }
 
     /// Returns the next f, `[n, E]`.
@@ -244,7 +244,7 @@ impl Stage {
         input: StageInput,
     ) -> Result<Tensor> {
         let StageInput { index, maps, deferred, f, z } = input;
-        let mut q = moves::sum(f, z)?;
+        let mut q = add(f, z)?;
         if let Some(norm) = &self.norm {
             q = norm.forward(&q)?;
         }
@@ -258,18 +258,18 @@ impl Stage {
         }
         let (joined, next) = match (keys.residual, &self.cat) {
             (Residual::Cat, Some(cat)) => {
-                let joined = columns(f, &o, None)?;
+                let joined = cat_columns(f, &o, None)?;
                 let next = affine(cat, &joined)?;
                 (joined, next)
             }
             (Residual::None, _) => (o.clone(), o),
             _ => {
-                let next = moves::sum(f, &o)?;
+                let next = add(f, &o)?;
                 (next.clone(), next)
             }
         };
         match &self.ffn {
-            Some(ffn) => moves::sum(&next, &ffn.forward(&joined)?),
+            Some(ffn) => add(&next, &ffn.forward(&joined)?),
             None => Ok(next),
         }
     }
@@ -338,8 +338,8 @@ impl Stage {
         };
         let gates = visible(gates, call)?;
         match g.key {
-            Some(_) => columns(q, &bias, Some(&gates)),
-            None => columns(&bias, &gates, None),
+            Some(_) => cat_columns(q, &bias, Some(&gates)),
+            None => cat_columns(&bias, &gates, None),
         }
     }
 }

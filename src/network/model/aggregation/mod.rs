@@ -29,7 +29,7 @@ use crate::network::config::{
     Aggregation as Keys, AggregationAblations, FeatureLevel, HeadInput, MaskMode,
 };
 #[cfg(feature = "gpu")]
-use crate::network::ops::DeviceArray;
+use crate::network::ops::TapeArray;
 use crate::network::ops::attention_gather::{Deferred, Level};
 use crate::network::ops::{Array, Backend};
 use ablated::Ablated;
@@ -100,15 +100,19 @@ impl<S> Stages<S> {
         step: impl Fn(&S, StageInput<'_, A>) -> Result<A>,
     ) -> Result<Descriptors<A>> {
         let deferred = |index: usize| prepared.deferred.get(index);
-        let mut geometry = z.geometry.detached().affine(0.0, 0.0)?;
+        let mut geometry = z.geometry.detach().affine(0.0, 0.0)?;
         for (index, (stage, maps)) in self.geometry.iter().zip(&prepared.geometry).enumerate() {
-            let (f, z, deferred) = (&geometry, &z.geometry, deferred(index));
+            let f = &geometry;
+            let z = &z.geometry;
+            let deferred = deferred(index);
             geometry = step(stage, StageInput { index, maps, deferred, f, z })?;
         }
         let mut appearance = geometry.clone();
         for (t, (stage, maps)) in self.appearance.iter().zip(&prepared.appearance).enumerate() {
             let index = self.geometry.len() + t;
-            let (f, z, deferred) = (&appearance, &z.appearance, deferred(index));
+            let f = &appearance;
+            let z = &z.appearance;
+            let deferred = deferred(index);
             appearance = step(stage, StageInput { index, maps, deferred, f, z })?;
         }
         Ok(Descriptors { geometry, appearance })
@@ -149,10 +153,10 @@ impl<A: Array> Prepared<A> {
 }
 
 #[cfg(feature = "gpu")]
-impl Prepared<DeviceArray> {
+impl Prepared<TapeArray> {
     /// Returns the same maps as leaves of tapes.
     pub fn leaves(&self) -> Self {
-        let leaves = |maps: &[DeviceArray]| maps.iter().map(DeviceArray::leaf).collect();
+        let leaves = |maps: &[TapeArray]| maps.iter().map(TapeArray::leaf).collect();
         let (geometry, appearance) = (leaves(&self.geometry), leaves(&self.appearance));
         Self { geometry, appearance, ..self.clone() }
     }
@@ -273,14 +277,15 @@ impl Aggregation {
                 let maps = maps.iter().map(A::to_host).collect::<Result<_>>()?;
                 let (geometry, appearance) = ablated.project(maps)?;
                 let back = |all: Vec<Tensor>| -> Result<Vec<A>> {
-                    all.iter().map(|map| means.like(map)).collect()
+                    all.iter().map(|map| means.upload(map)).collect()
                 };
                 (back(geometry)?, back(appearance)?)
             }
         };
-        let depths = match self.occlusion_gate {
-            true => Some(frames.depth_maps(&means.detached(), views.size()?)?),
-            false => None,
+        let depths = if self.occlusion_gate {
+            Some(frames.depth_maps(&means.detach(), views.size()?)?)
+        } else {
+            None
         };
         Ok(Prepared { geometry, appearance, levels, depths, deferred: Vec::new() })
     }
@@ -349,8 +354,8 @@ impl Aggregation {
                 let prepared = prepared.to_host()?;
                 let f = ablated.forward(&prepared, &own, frames, &host, mode, backend)?;
                 Ok(Descriptors {
-                    geometry: z.geometry.like(&f.geometry)?,
-                    appearance: z.geometry.like(&f.appearance)?,
+                    geometry: z.geometry.upload(&f.geometry)?,
+                    appearance: z.geometry.upload(&f.appearance)?,
                 })
             }
         }
@@ -368,8 +373,8 @@ impl Aggregation {
         match &self.plan {
             Plan::Ablated(ablated) if ablated.head_input() == HeadInput::F => Ok(f),
             _ => Ok(Descriptors {
-                geometry: f.geometry.plus(&z.geometry)?,
-                appearance: f.appearance.plus(&z.appearance)?,
+                geometry: f.geometry.add(&z.geometry)?,
+                appearance: f.appearance.add(&z.appearance)?,
             }),
         }
     }
@@ -390,5 +395,5 @@ fn visibility<A: Array>(prepared: &Prepared<A>, centres: &A, depth: &A) -> Resul
     let Some(maps) = &prepared.depths else { return Ok(None) };
     let [n, v, _] = depth.sizes()?;
     let (centres, depth) = (centres.reshape((n, v, 2))?, depth.reshape((n, v))?);
-    centres.occlusion(&depth, maps).map(Some)
+    centres.occlusion_gate(&depth, maps).map(Some)
 }

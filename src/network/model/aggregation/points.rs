@@ -97,7 +97,8 @@ fn key_points(keys: &Keys, call: &Call, learned: Option<&Linear>, f: &Tensor) ->
 
 fn map_offsets(keys: &Keys, call: &Call, learned: Option<&Linear>, q: &Tensor) -> Result<Tensor> {
     let n = q.dim(0)?;
-    let (v, levels) = (call.frames.0.len(), call.levels.len());
+    let v = call.frames.0.len();
+    let levels = call.levels.len();
     let centres = call.centres.unsqueeze(2)?;
     let own = centres.broadcast_as((n, v, levels, 1, 2))?;
     let all = match learned {

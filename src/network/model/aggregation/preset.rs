@@ -49,7 +49,7 @@ impl Stage {
     pub(super) fn project<A: Array>(&self, maps: &[A]) -> Result<A> {
         let layers = self.wk.iter().zip(&self.wv);
         let rows = maps.iter().zip(layers).map(|(map, (wk, wv))| affine(&joined(wk, wv)?, map));
-        A::joined(&rows.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
+        A::cat(&rows.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
     }
 
     /// Returns the next f, `[n, E]`.
@@ -61,12 +61,13 @@ impl Stage {
         let StageInput { maps, deferred, f, z, .. } = input;
         let q = match &self.norm {
             Some(norm) => norm.forward_of_sum(f, z)?,
-            None => f.plus(z)?,
+            None => f.add(z)?,
         };
         let [_, dim] = q.sizes()?;
         let query = self.query(call, &q)?;
         let gather = gather(call, dim);
-        let (centres, backend) = (&call.centres, call.backend);
+        let centres = &call.centres;
+        let backend = call.backend;
         maps.attention_gather(&query, centres, gather, deferred, Some(f), backend)
     }
 
@@ -76,14 +77,14 @@ impl Stage {
         let (v, l) = (call.frames.0.len(), call.levels.len());
         let bias = match &self.level_bias {
             Some(bias) => {
-                let bias = q.like(&bias.reshape((1, 1, l))?)?;
-                bias.expanded(&[n, v, l])?.reshape((n, v * l))?
+                let bias = q.upload(&bias.reshape((1, 1, l))?)?;
+                bias.broadcast_as(&[n, v, l])?.reshape((n, v * l))?
             }
-            None => q.constant(vec![0.0], &[1, 1])?.expanded(&[n, v * l])?,
+            None => q.new_tensor(vec![0.0], &[1, 1])?.broadcast_as(&[n, v * l])?,
         };
         let gates = view_shares(&self.gate, v)?.affine(v as f64, 0.0)?;
-        let gates = visible(q.like(&gates.unsqueeze(0)?)?.expanded(&[n, v])?, call)?;
-        q.columns(&bias, Some(&gates))
+        let gates = visible(q.upload(&gates.unsqueeze(0)?)?.broadcast_as(&[n, v])?, call)?;
+        q.cat_columns(&bias, Some(&gates))
     }
 }
 
@@ -131,7 +132,7 @@ pub(super) fn view_shares(beta: &Tensor, views: usize) -> Result<Tensor> {
 /// `gates` `[n, V]` times the visibility, if the occlusion gate is on.
 pub(super) fn visible<A: Array>(gates: A, call: &Call<'_, A>) -> Result<A> {
     match &call.visibility {
-        Some(visibility) => gates.times(visibility),
+        Some(visibility) => gates.mul(visibility),
         None => Ok(gates),
     }
 }

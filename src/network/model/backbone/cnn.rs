@@ -60,8 +60,8 @@ impl Cnn {
     /// # Errors
     /// Those of candle.
     pub fn forward<A: Array>(&self, images: &A, trace: &mut Trace<'_>) -> Result<CnnOutput<A>> {
-        let row = |v: [f32; 3]| images.constant(v.to_vec(), &[1, 3, 1, 1]);
-        let x = images.minus(&row(MEAN)?)?.over(&row(STD)?)?;
+        let row = |v: [f32; 3]| images.new_tensor(v.to_vec(), &[1, 3, 1, 1]);
+        let x = images.sub(&row(MEAN)?)?.div(&row(STD)?)?;
         trace.put("cnn.normalized_image", &x)?;
         let x = self.conv1.forward(&x)?;
         trace.put("cnn.conv1", &x)?;
@@ -112,6 +112,6 @@ impl Residual {
             Some(conv) => instance_norm(&conv.forward(x)?)?,
             None => x.clone(),
         };
-        skip.plus_then(&y, Activation::Relu)
+        skip.add_activation(&y, Activation::Relu)
     }
 }

@@ -43,7 +43,8 @@ fn relative_pose(cameras: &[Camera], i: usize, j: usize) -> Mat4 {
 
 /// Returns the sources of view `i` in MVSplat's order: i + 1, i + 2, … modulo V.
 fn ordered_sources(views: &Views, scene: usize, i: usize) -> impl Iterator<Item = usize> {
-    let (v, sources) = (views.views(), &views.sources()[scene][i]);
+    let v = views.views();
+    let sources = &views.sources()[scene][i];
     (1..v).map(move |offset| (i + offset) % v).filter(|j| sources.contains(j))
 }
 
@@ -105,7 +106,9 @@ fn trace_geometry(
     features: &Tensor,
     trace: &mut Trace<'_>,
 ) -> Result<()> {
-    let (b, v, [h, w]) = (views.scenes(), views.views(), sweep.size);
+    let b = views.scenes();
+    let v = views.views();
+    let [h, w] = sweep.size;
     let d = sweep.candidates();
     let dev = &Device::Cpu;
     let candidates: Vec<f32> = sweep.depths.iter().flatten().map(|z| 1.0 / z).collect();
@@ -173,7 +176,7 @@ impl Refinement {
         trace: &mut Trace<'_>,
     ) -> Result<A> {
         let name = "cv.corr_refine_net";
-        let input = volume.beside(features, 1)?;
+        let input = volume.cat_channels(features)?;
         let x = self.stem.0.forward(&input)?;
         trace.put(&format!("{name}.0"), &x)?;
         let x = self.stem.1.forward(&x)?;
@@ -185,7 +188,7 @@ impl Refinement {
         trace.put(&format!("{name}.out_vb"), &x)?;
         let residual = self.residual.forward(&input)?;
         trace.put("cv.regressor_residual_vb", &residual)?;
-        let x = x.plus(&residual)?;
+        let x = x.add(&residual)?;
         trace.put("cv.refined_correlation_vb", &x)?;
         Ok(x)
     }

@@ -127,7 +127,7 @@ impl DepthPredictor {
     ) -> Result<Output<A>> {
         let Input { views, images, cnn, trans } = input;
         let disparity = self.coarse(views, &trans, trace)?;
-        let joined = trans.beside(&cnn, 1)?;
+        let joined = trans.cat_channels(&cnn)?;
         drop((trans, cnn));
         let low = self.upsampler.forward(&joined)?;
         drop(joined);
@@ -153,16 +153,16 @@ impl DepthPredictor {
         let [rows, d, h, w] = logits.sizes()?;
         // Candidates are the last axis: a strided softmax or sum is many times slower.
         let pdf = logits.channels_last()?.softmax()?;
-        trace.put_with("depth.pdf_vb", || pdf.permuted(&[0, 2, 1])?.reshape((rows, d, h, w)))?;
-        let candidates = pdf.constant(candidates.concat(), &[rows, d])?;
+        trace.put_with("depth.pdf_vb", || pdf.permute(&[0, 2, 1])?.reshape((rows, d, h, w)))?;
+        let candidates = pdf.new_tensor(candidates.concat(), &[rows, d])?;
         let map = |x: A| x.reshape((rows, 1, h, w));
         let disparity = map(pdf.weighted_sum(&candidates)?)?;
         trace.put("depth.coarse_disp_vb", &disparity)?;
-        let pdf_max = map(pdf.largest()?)?;
+        let pdf_max = map(pdf.max_keepdim(2)?)?;
         trace.put("depth.pdf_max_vb", &pdf_max)?;
-        let full = disparity.resized([DOWNSCALE * h, DOWNSCALE * w], None)?;
+        let full = disparity.upsample_bilinear2d([DOWNSCALE * h, DOWNSCALE * w], None)?;
         trace.put("depth.fullres_disp_vb", &full)?;
-        let pdf_max = pdf_max.repeated(DOWNSCALE)?;
+        let pdf_max = pdf_max.upsample_nearest2d(DOWNSCALE)?;
         trace.put("depth.pdf_max_fullres_vb", &pdf_max)?;
         Ok(Disparity { full, pdf_max })
     }
@@ -181,7 +181,7 @@ impl DepthPredictor {
             self.proj_feature.forward(&up.row(r)?)
         })?;
         trace.put("depth.proj_feature_vb", &projected)?;
-        let x = A::joined(&[images, &projected, &disparity.full, &disparity.pdf_max], 1)?;
+        let x = A::cat(&[images, &projected, &disparity.full, &disparity.pdf_max], 1)?;
         drop(projected);
         trace.put(&format!("{name}.in_vb"), &x)?;
         let x = self.refine_stem.0.forward(&x)?;
@@ -203,12 +203,12 @@ impl DepthPredictor {
         let raw = each_row(images, |r| {
             trace.step()?;
             let row = |x: &A| x.narrow(0, r, 1);
-            let x = A::joined(&[&row(refined)?, &row(images)?], 1)?.beside(&up.row(r)?, 1)?;
+            let x = A::cat(&[&row(refined)?, &row(images)?], 1)?.cat_channels(&up.row(r)?)?;
             self.to_gaussians.forward(&x)?.channels_last()
         })?;
         trace.put_with("depth.to_gaussians_vb", || {
             let [rows, _, h, w] = images.sizes()?;
-            raw.permuted(&[0, 2, 1])?.reshape((rows, (), h, w))
+            raw.permute(&[0, 2, 1])?.reshape((rows, (), h, w))
         })?;
         Ok(raw)
     }
@@ -224,10 +224,10 @@ impl DepthPredictor {
         let (b, g) = (views.scenes(), self.per_pixel);
         let out = self.to_disparity.forward(refined)?;
         trace.put("depth.to_disparity_vb", &out)?;
-        let full = out.narrow(1, 0, g)?.plus(&disparity.full)?.channels_last()?;
+        let full = out.narrow(1, 0, g)?.add(&disparity.full)?.channels_last()?;
         let depths = each_row(&full, |r| {
             let NearFar { near, far } = views.near_far[r % b][r / b];
-            full.narrow(0, r, 1)?.clamped(f64::from(1.0 / far), f64::from(1.0 / near))?.reciprocal()
+            full.narrow(0, r, 1)?.clamp(f64::from(1.0 / far), f64::from(1.0 / near))?.recip()
         })?;
         Ok((depths, sigmoid(&out.narrow(1, g, g)?.channels_last()?)?))
     }
@@ -242,10 +242,7 @@ struct Upsampled<A> {
 
 impl<A: Array> Upsampled<A> {
     fn new(low: A, trace: &mut Trace<'_>) -> Result<Self> {
-        let kept = match low.is_tracked() || trace.is_on() {
-            true => Some(Self::make(&low)?),
-            false => None,
-        };
+        let kept = if low.track_op() || trace.is_on() { Some(Self::make(&low)?) } else { None };
         if let Some(up) = &kept {
             trace.put("depth.upsampler_vb", up)?;
         }
@@ -254,7 +251,7 @@ impl<A: Array> Upsampled<A> {
 
     fn make(low: &A) -> Result<A> {
         let [_, _, h, w] = low.sizes()?;
-        low.resized([DOWNSCALE * h, DOWNSCALE * w], Some(Activation::Gelu))
+        low.upsample_bilinear2d([DOWNSCALE * h, DOWNSCALE * w], Some(Activation::Gelu))
     }
 
     /// Returns row `r`, `[1, C, H, W]`.
@@ -269,5 +266,5 @@ impl<A: Array> Upsampled<A> {
 /// Joins `f` of every row index of `like` along the first dimension.
 fn each_row<A: Array>(like: &A, f: impl Fn(usize) -> Result<A>) -> Result<A> {
     let rows = (0..like.dims()[0]).map(f).collect::<Result<Vec<_>>>()?;
-    A::joined(&rows.iter().collect::<Vec<_>>(), 0)
+    A::cat(&rows.iter().collect::<Vec<_>>(), 0)
 }

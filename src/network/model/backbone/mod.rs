@@ -102,7 +102,7 @@ impl Mvsplat {
         };
         let out = self.depth.forward(input, trace)?;
         let pooled = |s: usize| -> Result<A> {
-            let x = trans4.reshape((b * v, c, h, w))?.pooled(s)?;
+            let x = trans4.reshape((b * v, c, h, w))?.avg_pool2d(s)?;
             x.reshape((b, v, c, h / s, w / s))
         };
         let [_, half, hh, hw] = cnn.half.sizes()?;
@@ -142,7 +142,7 @@ fn swapped<A: Array>(x: &A) -> Result<A> {
         Some(first) => first.reverse(),
         None => bail!("rows: expected two dimensions or more, got {:?}", x.dims()),
     }
-    x.permuted(&order)
+    x.permute(&order)
 }
 
 /// Maps `[V·B, …]` to `[B, V, …]`.

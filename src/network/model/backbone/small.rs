@@ -18,7 +18,7 @@ use crate::network::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, La
 use crate::network::model::trace::Trace;
 use crate::network::model::{BackboneOutput, Views};
 use crate::network::ops::plane_sweep::{Pair, Sweep, pair, relative_pose};
-use crate::network::ops::small::{Candidates, MeanOver, Start};
+use crate::network::ops::small::{Candidates, MeanOver, SmallArray, Start};
 use crate::network::ops::{Array, Backend};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
@@ -86,7 +86,7 @@ impl Residual {
 
     fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let y = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Gelu)?;
-        x.plus_then(&self.norm2.forward(&self.conv2.forward(&y)?)?, Activation::Gelu)
+        x.add_activation(&self.norm2.forward(&self.conv2.forward(&y)?)?, Activation::Gelu)
     }
 }
 
@@ -127,9 +127,10 @@ impl SmallBackbone {
         };
         let unet = Unet::new(swept + c4, &config.unet_channels, vb.pp("unet"))?;
         let top = config.unet_channels[0];
-        let upsampling = match config.convex_upsampling {
-            true => Some(ConvexUpsampling::new(top, vb.pp("upsampling"))?),
-            false => None,
+        let upsampling = if config.convex_upsampling {
+            Some(ConvexUpsampling::new(top, vb.pp("upsampling"))?)
+        } else {
+            None
         };
         let hidden = config.head_channels;
         let outputs = 9 + 3 * sh_coefficients(config.primaries.sh_degree) + 1;
@@ -185,7 +186,7 @@ impl SmallBackbone {
     ///
     /// # Errors
     /// Those of [`SmallBackbone::forward`] and of the checkpoint.
-    pub fn forward_on<A: Array>(
+    pub fn forward_on<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
@@ -203,7 +204,7 @@ impl SmallBackbone {
             let maps = [&depths, &densities];
             depths = images.depth_consensus(&views.cameras, &views.near_far, maps)?;
         }
-        let pool = |s: usize| -> Result<A> { split_views(&deep.pooled(s)?, b, v) };
+        let pool = |s: usize| -> Result<A> { split_views(&deep.avg_pool2d(s)?, b, v) };
         let features = vec![
             (FeatureLevel::Trans4, split_views(&deep, b, v)?),
             (FeatureLevel::Trans8, pool(2)?),
@@ -213,7 +214,7 @@ impl SmallBackbone {
             (FeatureLevel::Refine1, split_views(&heads.hidden, b, v)?),
         ];
         if self.config.cross_check {
-            densities = densities.times(&images.cross_check(&views.cameras, &depths)?)?;
+            densities = densities.mul(&images.cross_check(&views.cameras, &depths)?)?;
         }
         let output = BackboneOutput {
             raw: heads.raw.reshape((b, v, h * w, ()))?,
@@ -242,7 +243,7 @@ impl SmallBackbone {
     ///
     /// # Errors
     /// Those of [`SmallBackbone::depth`] and of the checkpoint.
-    pub fn depth_on<A: Array>(
+    pub fn depth_on<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
@@ -254,7 +255,7 @@ impl SmallBackbone {
     }
 
     /// The network up to the heads.
-    fn matched<A: Array>(
+    fn matched<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
@@ -275,40 +276,44 @@ impl SmallBackbone {
         trace.step()?;
         let stem = self.sweep(views, images, &feat4, mean)?;
         trace.step()?;
-        let deep = self.unet.forward(&stem.input.beside(&feat4, 1)?)?;
+        let deep = self.unet.forward(&stem.input.cat_channels(&feat4)?)?;
         trace.step()?;
         let mut logits = self.logits.forward(&deep)?;
         if let Some(scores) = &stem.scores
             && self.config.stem_skip
         {
-            logits = logits.lifted(scores, &self.stem_factor)?;
+            logits = logits.add_scores(scores, &self.stem_factor)?;
         }
         let [index, mass] = self.expected_index(&logits, mean)?;
-        let rough = index.minus(&local_mean(&index)?)?.absolute()?;
-        let sides = A::joined(&[&mass, &rough.affine(0.25, 0.0)?], 1)?;
-        let hidden = deep.beside(&sides, 1)?;
+        let rough = index.sub(&local_mean(&index)?)?.abs()?;
+        let sides = A::cat(&[&mass, &rough.affine(0.25, 0.0)?], 1)?;
+        let hidden = deep.cat_channels(&sides)?;
         let hidden = self.confidence.0.forward_then(&hidden, Activation::Gelu)?;
         let start = mass.affine(CONFIDENCE_SLOPE, CONFIDENCE_SHIFT)?;
-        let confidence = self.confidence.1.forward(&hidden)?.plus(&start)?;
+        let confidence = self.confidence.1.forward(&hidden)?.add(&start)?;
         let [index, confidence] = match &self.upsampling {
             Some(convex) => convex.apply(&deep, &rgb, [&index, &confidence])?,
-            None => [index.resized([h, w], None)?, confidence.resized([h, w], None)?],
+            None => [
+                index.upsample_bilinear2d([h, w], None)?,
+                confidence.upsample_bilinear2d([h, w], None)?,
+            ],
         };
         trace.step()?;
         Ok(Matched { rgb, feat2, feat4, deep, logits, index, confidence })
     }
 
     /// Matching scores of every view, of its sources together.
-    fn sweep<A: Array>(
+    fn sweep<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
         feat4: &A,
         mean: DisparityMean,
     ) -> Result<Swept<A>> {
-        let unit = self.matching.forward(feat4)?.unit_channels()?;
+        let unit = self.matching.forward(feat4)?.normalize_channels()?;
         let disparities = candidates(views, self.config.depth_candidates);
-        let (count, sources) = (views.scenes() * views.views(), views.sources_per_view());
+        let count = views.scenes() * views.views();
+        let sources = views.sources_per_view();
         let rows = source_rows(views);
         // The volumes are large: inference computes those of one view at a time, while a
         // training graph keeps all of them anyway.
@@ -334,7 +339,7 @@ impl SmallBackbone {
 
     /// Volume `[R, C, D, h, w]` of the correlation and the raw matching channels, for rows of
     /// (view, source), rows of `unit` `[B·V, C, h, w]`.
-    fn volume<A: Array>(
+    fn volume<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
@@ -343,7 +348,8 @@ impl SmallBackbone {
         rows: &[[usize; 2]],
     ) -> Result<A> {
         let [_, channels, h, w] = unit.sizes()?;
-        let (d, v) = (self.config.depth_candidates, views.views());
+        let d = self.config.depth_candidates;
+        let v = views.views();
         let depths = |&[i, _]: &[usize; 2]| {
             disparities[i / v][i % v].iter().map(|d| 1.0 / d).collect::<Vec<f32>>()
         };
@@ -357,19 +363,19 @@ impl SmallBackbone {
             size: [h, w],
         };
         let references: Vec<u32> = rows.iter().map(|r| r[0] as u32).collect();
-        let reference = match references.iter().enumerate().all(|(i, r)| i == *r as usize) {
-            true => unit.narrow(0, 0, rows.len())?,
-            false => unit.selected(0, &references)?,
+        let reference = if references.iter().enumerate().all(|(i, r)| i == *r as usize) {
+            unit.narrow(0, 0, rows.len())?
+        } else {
+            unit.index_select(&references, 0)?
         };
         let learned = reference.plane_sweep(unit, sweep, &self.backend)?;
         // [R, 1, D·h, w]
         let learned = learned.reshape((rows.len(), 1, d * h, w))?;
-        let volume = match self.config.raw_matching {
-            true => {
-                let raw = images.raw_matching(&views.cameras, disparities, rows)?;
-                learned.beside(&raw.reshape((rows.len(), (), d * h, w))?, 1)?
-            }
-            false => learned,
+        let volume = if self.config.raw_matching {
+            let raw = images.raw_matching(&views.cameras, disparities, rows)?;
+            learned.cat_channels(&raw.reshape((rows.len(), (), d * h, w))?)?
+        } else {
+            learned
         };
         volume.reshape((rows.len(), (), d, h, w))
     }
@@ -378,23 +384,23 @@ impl SmallBackbone {
     /// does not show a pixel's surface has no clear match there. Therefore the weight of a source
     /// is the square of its probability mass around the mode (after Zhang et al. 2020, *Visibility-aware
     /// Multi-view Stereo Network*).
-    fn visible_mean<A: Array>(&self, scores: &A, sources: usize) -> Result<A> {
+    fn visible_mean<A: SmallArray>(&self, scores: &A, sources: usize) -> Result<A> {
         if sources == 1 {
             return Ok(scores.clone());
         }
         let [rows, d, h, w] = scores.sizes()?;
         let zeros = scores.affine(0.0, 0.0)?;
-        let logits = zeros.lifted(scores, &self.stem_factor)?.detached();
+        let logits = zeros.add_scores(scores, &self.stem_factor)?.detach();
         let [_, mass] = logits.expectation(VISIBILITY_WINDOW, MeanOver::All)?;
-        let weights = mass.squared()?.affine(1.0, 1e-6)?;
+        let weights = mass.sqr()?.affine(1.0, 1e-6)?;
         let weights = weights.reshape((rows / sources, sources, 1, h, w))?;
         let scores = scores.reshape((rows / sources, sources, d, h, w))?;
-        scores.times(&weights)?.summed(1)?.over(&weights.summed(1)?)
+        scores.mul(&weights)?.sum(1)?.div(&weights.sum(1)?)
     }
 
     /// Expected candidate index, and the probability within the window around the mode:
     /// `[B·V, 1, h, w]` each.
-    fn expected_index<A: Array>(&self, logits: &A, mean: DisparityMean) -> Result<[A; 2]> {
+    fn expected_index<A: SmallArray>(&self, logits: &A, mean: DisparityMean) -> Result<[A; 2]> {
         let window = self.config.mode_window;
         let over = match mean {
             DisparityMean::AroundMode if window > 0 => MeanOver::Window,
@@ -404,7 +410,7 @@ impl SmallBackbone {
     }
 
     /// `sides`: candidate index and confidence (a logit), `[B·V, 1, H, W]`.
-    fn heads<A: Array>(
+    fn heads<A: SmallArray>(
         &self,
         rgb: &A,
         deep: &A,
@@ -458,7 +464,7 @@ impl SmallBackbone {
     }
 
     /// Distance along the unit ray, `[B, V, H·W, 1]`, from candidate indices.
-    fn ray_distance<A: Array>(&self, views: &Views, index: &A) -> Result<A> {
+    fn ray_distance<A: SmallArray>(&self, views: &Views, index: &A) -> Result<A> {
         let (b, v, _, h, w) = views.images.dims5()?;
         let steps = (self.config.depth_candidates - 1) as f32;
         let range = |&NearFar { near, far }: &NearFar| {
@@ -475,7 +481,7 @@ impl SmallBackbone {
 fn whole<A: Array>(mut parts: Vec<A>) -> Result<A> {
     match parts.len() {
         1 => Ok(parts.swap_remove(0)),
-        _ => A::joined(&parts.iter().collect::<Vec<_>>(), 0),
+        _ => A::cat(&parts.iter().collect::<Vec<_>>(), 0),
     }
 }
 
@@ -531,7 +537,7 @@ fn sweep_pairs(views: &Views, [i, j]: [usize; 2], h: usize, w: usize) -> Result<
 fn mean_of<A: Array>(volume: &A, sources: usize) -> Result<A> {
     match volume.sizes()? {
         _ if sources == 1 => Ok(volume.clone()),
-        [rows, c, h, w] => volume.reshape((rows / sources, sources, c, h, w))?.averaged(1),
+        [rows, c, h, w] => volume.reshape((rows / sources, sources, c, h, w))?.mean(1),
     }
 }
 

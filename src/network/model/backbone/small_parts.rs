@@ -3,7 +3,8 @@
 use crate::network::model::layers::{
     Activation, Conv2d, ConvShape, GroupNorm, LayerInit, default_init,
 };
-use crate::network::ops::{Array, ConvSteps};
+use crate::network::ops::small::SmallArray;
+use crate::network::ops::{Array, ConvConfig};
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
@@ -13,9 +14,9 @@ pub(super) fn conv_norm_gelu<A: Array>(x: &A, layer: &(Conv2d, GroupNorm)) -> Re
 }
 
 /// Mean over 3×3 pixels of `[B, 1, h, w]`, edges repeated.
-pub(super) fn local_mean<A: Array>(x: &A) -> Result<A> {
-    let box3 = x.constant(vec![1.0 / 9.0; 9], &[1, 1, 3, 3])?;
-    x.edges_repeated()?.convolved(&box3, None, ConvSteps { stride: 1, padding: 0 }, None)
+pub(super) fn local_mean<A: SmallArray>(x: &A) -> Result<A> {
+    let box3 = x.new_tensor(vec![1.0 / 9.0; 9], &[1, 1, 3, 3])?;
+    x.replication_pad2d(1)?.conv2d(&box3, None, ConvConfig { stride: 1, padding: 0 }, None)
 }
 
 /// Two 3×3×3 convolutions over (disparity, y, x): `[B, C, D, h, w]` to scores
@@ -49,10 +50,10 @@ impl Stem {
         let on = |i: usize| -> Result<[A; 2]> {
             Ok([volume.parameter(&self.weights[i])?, volume.parameter(&self.biases[i])?])
         };
-        let steps = ConvSteps { stride: 1, padding: 1 };
+        let steps = ConvConfig { stride: 1, padding: 1 };
         let ([first, b0], [second, b1]) = (on(0)?, on(1)?);
-        let hidden = volume.convolved(&first, Some(&b0), steps, Some(Activation::Gelu))?;
-        let scores = hidden.convolved(&second, Some(&b1), steps, None)?;
+        let hidden = volume.conv3d(&first, Some(&b0), steps, Some(Activation::Gelu))?;
+        let scores = hidden.conv3d(&second, Some(&b1), steps, None)?;
         let [b, _, d, h, w] = scores.sizes()?;
         scores.reshape((b, d, h, w))
     }
@@ -124,7 +125,7 @@ impl Unet {
             skips.push(std::mem::replace(&mut x, next));
         }
         for (block, skip) in self.up.iter().zip(&skips).rev() {
-            x = block.forward(&skip.beside(&x, 2)?)?;
+            x = block.forward(&skip.cat_upsampled(&x, 2)?)?;
         }
         Ok(x)
     }
@@ -151,12 +152,12 @@ impl ConvexUpsampling {
 
     /// Upsamples `maps`, each `[B, 1, h, w]`, to `[B, 1, 4h, 4w]`. The mask comes from
     /// `deep` `[B, C, h, w]` and the image `rgb` `[B, 3, 4h, 4w]`.
-    pub(super) fn apply<A: Array>(&self, deep: &A, rgb: &A, maps: [&A; 2]) -> Result<[A; 2]> {
+    pub(super) fn apply<A: SmallArray>(&self, deep: &A, rgb: &A, maps: [&A; 2]) -> Result<[A; 2]> {
         let [b, _, h, w] = deep.sizes()?;
         // The image's 4×4 blocks as channels.
-        let blocks = rgb.reshape(vec![b, 3, h, 4, w, 4])?.permuted(&[0, 1, 3, 5, 2, 4])?;
+        let blocks = rgb.reshape(vec![b, 3, h, 4, w, 4])?.permute(&[0, 1, 3, 5, 2, 4])?;
         let blocks = blocks.reshape((b, 48, h, w))?.affine(1.0, -0.5)?;
-        let hidden = self.hidden.forward_then(&deep.beside(&blocks, 1)?, Activation::Gelu)?;
+        let hidden = self.hidden.forward_then(&deep.cat_channels(&blocks)?, Activation::Gelu)?;
         self.mask.forward(&hidden)?.upsample_convex(maps, &bilinear_shares())
     }
 }

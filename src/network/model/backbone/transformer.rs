@@ -68,20 +68,20 @@ impl Transformer {
             bail!("transformer: expected a map that splits into {s}x{s} windows, got {h}x{w}");
         }
         let positions = position_encoding(c, [h, w], s);
-        let x = cnn.plus(&cnn.constant(positions, &[1, 1, c, h, w])?)?;
+        let x = cnn.add(&cnn.new_tensor(positions, &[1, 1, c, h, w])?)?;
         trace.put("transformer.pos_added", &x)?;
         let mut x = vb_rows(&x)?.channels_last()?;
         for (i, layer) in self.layers.iter().enumerate() {
             // A single window has no seams to shift.
             let roll = if i % 2 == 1 && s > 1 { Roll::Half } else { Roll::None };
             let windows = Windows::new([h, w], s, roll);
-            let input = x.selected(1, &windows.raster())?;
+            let input = x.index_select(&windows.raster(), 1)?;
             let updated = layer.self_attn.forward(&input, &[&input], &windows)?;
             let back = windows.inverse();
             trace.put_with(&format!("transformer.layer{i}.self_attn_vb"), || {
-                updated.selected(1, &back)
+                updated.index_select(&back, 1)
             })?;
-            x = layer.cross(&updated, &input, sources, &windows)?.selected(1, &back)?;
+            x = layer.cross(&updated, &input, sources, &windows)?.index_select(&back, 1)?;
             trace.put(&format!("transformer.layer{i}.out_vb"), &x)?;
         }
         let rows = x.dims()[0];
@@ -108,7 +108,7 @@ impl Layer {
         let targets = (0..count).map(|t| {
             let row = |r: usize| sources[r % scenes][r / scenes][t] * scenes + r % scenes;
             let rows: Vec<u32> = (0..views * scenes).map(|r| row(r) as u32).collect();
-            input.selected(0, &rows)
+            input.index_select(&rows, 0)
         });
         let targets = targets.collect::<Result<Vec<_>>>()?;
         self.cross_attn.forward(x, &targets.iter().collect::<Vec<_>>(), w)
@@ -151,13 +151,14 @@ impl SubLayer {
     /// `x` and each of `targets` `[V·B, tokens, C]` in window order.
     fn forward<A: Array>(&self, x: &A, targets: &[&A], windows: &Windows) -> Result<A> {
         let [rows, tokens, c] = x.sizes()?;
-        let (n, m) = (windows.count(), targets.len());
+        let n = windows.count();
+        let m = targets.len();
         let len = tokens / n;
         // Keys of a window: position-major, target-minor.
         let gather = |proj: &Linear| -> Result<A> {
             let all = targets.iter().map(|t| proj.forward(*t)?.reshape((rows * n, len, 1, c)));
             let all = all.collect::<Result<Vec<_>>>()?;
-            A::joined(&all.iter().collect::<Vec<_>>(), 2)?.reshape((rows * n, len * m, c))
+            A::cat(&all.iter().collect::<Vec<_>>(), 2)?.reshape((rows * n, len * m, c))
         };
         let q = self.q_proj.forward(x)?.reshape((rows * n, len, c))?;
         let (k, v) = (gather(&self.k_proj)?, gather(&self.v_proj)?);
@@ -186,17 +187,17 @@ fn feed_forward<A: Array>(
     let [scale, shift] = norm.parameters();
     let affine = [on(scale)?, on(shift)?];
     let mut all = [x, message].into_iter().chain(&weights).chain(&affine);
-    if !all.any(A::is_tracked) {
+    if !all.any(A::track_op) {
         return x.feed_forward(message, weights.each_ref(), affine.each_ref());
     }
     let rows = x.dims()[0];
     let blocks = (0..rows).step_by(FFN_ROWS).map(|start| {
         let n = FFN_ROWS.min(rows - start);
         let (x, message) = (x.narrow(0, start, n)?, message.narrow(0, start, n)?);
-        let hidden = gelu(&up.forward(&A::joined(&[&x, &message], 1)?)?)?;
+        let hidden = gelu(&up.forward(&A::cat(&[&x, &message], 1)?)?)?;
         norm.forward_onto(&x, &down.forward(&hidden)?)
     });
-    A::joined(&blocks.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
+    A::cat(&blocks.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
 }
 
 /// Offset of the windows, as in Swin transformers.
@@ -230,7 +231,8 @@ impl Windows {
     /// Rolled coordinates (row, column) in window order: windows row-major, tokens row-major
     /// inside each.
     fn rolled(&self) -> impl Iterator<Item = [usize; 2]> + use<> {
-        let (s, [wh, ww]) = (self.splits, self.size.map(|n| n / self.splits));
+        let s = self.splits;
+        let [wh, ww] = self.size.map(|n| n / self.splits);
         (0..s * s).flat_map(move |win| {
             (0..wh * ww).map(move |i| [win / s * wh + i / ww, win % s * ww + i % ww])
         })
@@ -285,9 +287,10 @@ fn position_encoding(c: usize, size: [usize; 2], splits: usize) -> Vec<f32> {
     for k in 0..c {
         for y in 0..h {
             for x in 0..w {
-                out.push(match k < half {
-                    true => value(k, y, h / splits),
-                    false => value(k - half, x, w / splits),
+                out.push(if k < half {
+                    value(k, y, h / splits)
+                } else {
+                    value(k - half, x, w / splits)
                 });
             }
         }

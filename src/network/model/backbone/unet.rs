@@ -4,7 +4,7 @@
 
 use crate::network::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, default_init};
 use crate::network::model::trace::Trace;
-use crate::network::ops::{Array, ConvSteps};
+use crate::network::ops::{Array, ConvConfig};
 use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 
@@ -116,7 +116,7 @@ impl UNet {
         }
         for (i, up) in self.up.iter().enumerate() {
             let joined = match skips.pop() {
-                Some(skip) => x.beside(&skip, 1)?,
+                Some(skip) => x.cat_channels(&skip)?,
                 None => x,
             };
             x = up.block.forward(&joined)?;
@@ -124,7 +124,7 @@ impl UNet {
                 x = attention.forward(&x, views)?;
             }
             if let Some(grow) = &up.grow {
-                x = grow.forward(&x.repeated(2)?)?;
+                x = grow.forward(&x.upsample_nearest2d(2)?)?;
             }
             trace.put(&format!("{name}.output_blocks.{i}"), &x)?;
         }
@@ -147,9 +147,10 @@ struct ResBlock {
 impl ResBlock {
     fn new(c_in: usize, c: usize, vb: VarBuilder) -> Result<Self> {
         let (a, b) = (vb.pp("in_layers"), vb.pp("out_layers"));
-        let skip = match c_in == c {
-            true => None,
-            false => Some(Conv2d::new(c_in, c, ConvShape::K1, vb.pp("skip_connection"))?),
+        let skip = if c_in == c {
+            None
+        } else {
+            Some(Conv2d::new(c_in, c, ConvShape::K1, vb.pp("skip_connection"))?)
         };
         Ok(Self {
             conv1: Conv2d::new(c_in, c, ConvShape::K3, a.pp("0"))?,
@@ -199,20 +200,22 @@ impl Attention {
 
     fn forward<A: Array>(&self, x: &A, views: usize) -> Result<A> {
         let [rows, c, h, w] = x.sizes()?;
-        let (scenes, heads, n) = (rows / views, self.channels / HEAD, h * w);
+        let scenes = rows / views;
+        let heads = self.channels / HEAD;
+        let n = h * w;
         let layer = |x: &A, (weight, bias): &(Tensor, Tensor)| {
             let (weight, bias) = (x.parameter(weight)?, x.parameter(bias)?);
-            x.convolved(&weight, Some(&bias), ConvSteps { stride: 1, padding: 0 }, None)
+            x.conv2d(&weight, Some(&bias), ConvConfig { stride: 1, padding: 0 }, None)
         };
         let qkv = layer(x, &self.qkv)?.reshape(vec![views, scenes, heads, 3, HEAD, n])?;
         let part = |i: usize| -> Result<A> {
-            let x = qkv.narrow(3, i, 1)?.permuted(&[1, 2, 0, 5, 4, 3])?;
+            let x = qkv.narrow(3, i, 1)?.permute(&[1, 2, 0, 5, 4, 3])?;
             x.reshape((scenes * heads, views * n, HEAD))
         };
         // MVSplat's code scales q and k by HEAD^(−1/4) each.
         let scale = 1.0 / (HEAD as f32).sqrt();
         let y = part(0)?.attention(&part(1)?, &part(2)?, scale, None)?;
-        let y = y.reshape((scenes, heads, views, n, HEAD))?.permuted(&[2, 0, 1, 4, 3])?;
+        let y = y.reshape((scenes, heads, views, n, HEAD))?.permute(&[2, 0, 1, 4, 3])?;
         let y = layer(&y.reshape((rows, c, h, w))?, &self.proj_out)?;
         self.norm.forward_onto(x, &y, None)
     }

@@ -9,7 +9,7 @@ use crate::network::config::{FeatureLevel, Primaries as Settings, ShInput};
 use crate::network::model::primaries::{adapter_of, basis_of};
 use crate::network::model::trace::Checkpoint;
 use crate::network::model::{BackboneOutput, Views, feature_of};
-use crate::network::ops::{Array, ColourLayout, DeviceArray, DeviceSplats, Executor};
+use crate::network::ops::{Array, ColourLayout, DeviceSplats, Executor, TapeArray};
 use crate::scene::splats::Splats;
 use candle_core::{DType, Device, Result, Tensor, bail};
 use std::sync::Arc;
@@ -22,16 +22,16 @@ use subsplat_kernels::layout::{
 #[derive(Clone, Debug)]
 pub struct DeviceParents {
     /// `[N, 11]`, columns as in [`subsplat_kernels::layout`].
-    rows: DeviceArray,
+    rows: TapeArray,
     /// `[N, D, 3]`, world frame.
-    sh: DeviceArray,
+    sh: TapeArray,
     /// `[N, 3·D]`, colour-major, in the frame of [`crate::network::config::Embed::sh`].
-    sh_input: DeviceArray,
+    sh_input: TapeArray,
     sh_basis: ShBasis,
     /// `[1, V, H·W, G]`: distance along the unit ray, world units.
-    pub(in crate::network::model) depths: DeviceArray,
+    pub(in crate::network::model) depths: TapeArray,
     /// The backbone's feature maps.
-    features: Vec<(FeatureLevel, DeviceArray)>,
+    features: Vec<(FeatureLevel, TapeArray)>,
     /// Primaries of a view.
     pub(in crate::network::model) per_view: usize,
 }
@@ -42,7 +42,7 @@ pub struct DeviceChildren {
     /// In the order of the parents.
     parts: Vec<DeviceSplats>,
     /// `[N, D, 3]`: SH of all parents.
-    sh: DeviceArray,
+    sh: TapeArray,
     sh_basis: ShBasis,
     /// K.
     k: usize,
@@ -55,7 +55,7 @@ impl DeviceParents {
     /// # Errors
     /// Shapes that do not fit; errors of the device.
     pub(in crate::network::model) fn new(
-        output: BackboneOutput<DeviceArray>,
+        output: BackboneOutput<TapeArray>,
         views: &Views,
         settings: &Settings,
         sh_input: ShInput,
@@ -103,7 +103,7 @@ impl DeviceChildren {
     pub(in crate::network::model) fn to_host(
         &self,
         executor: &Executor,
-        more: &[&DeviceArray],
+        more: &[&TapeArray],
     ) -> Result<(Children, Vec<Tensor>)> {
         let rows = self.parts.iter().map(|part| &part.rows);
         let gains = self.parts.iter().filter_map(|part| part.gain.as_ref());
@@ -114,9 +114,10 @@ impl DeviceChildren {
         let Some(sh) = read.pop() else { bail!("children: expected SH, got none") };
         let gains = read.split_off(self.parts.len());
         let rows = Tensor::cat(&read, 0)?;
-        let gain = match gains.is_empty() {
-            true => Tensor::ones(rows.dim(0)?, DType::F32, &Device::Cpu)?,
-            false => Tensor::cat(&gains, 0)?,
+        let gain = if gains.is_empty() {
+            Tensor::ones(rows.dim(0)?, DType::F32, &Device::Cpu)?
+        } else {
+            Tensor::cat(&gains, 0)?
         };
         // One channel has no axis of its own.
         let gain = if gain.dims().last() == Some(&1) { gain.squeeze(1)? } else { gain };
@@ -168,7 +169,8 @@ impl Trunk {
             Ok(DeviceSplats { rows, gain: Some(gain), sh: sh.narrow(0, span.first, span.len)? })
         };
         let spans = chunks(n, scene.per_view, CHUNK_GPU);
-        let (k, sh_basis) = (scene.rules.children(), parents.sh_basis);
+        let k = scene.rules.children();
+        let sh_basis = parents.sh_basis;
         let parts = spans.map(of_chunk).collect::<Result<_>>()?;
         Ok(DeviceChildren { parts, sh: sh.clone(), sh_basis, k })
     }
@@ -195,7 +197,7 @@ impl Trunk {
         parts: &Parts,
         views: &'a Views,
         parents: &DeviceParents,
-    ) -> Result<Scene<'a, DeviceArray>> {
+    ) -> Result<Scene<'a, TapeArray>> {
         let [n, _] = parents.rows.sizes()?;
         check_views(views, n, parents.per_view)?;
         let columns = |first: usize, count: usize| parents.rows.narrow(1, first, count);

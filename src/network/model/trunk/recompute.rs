@@ -19,7 +19,7 @@ use crate::network::ops::attention_gather::Deferred;
 use crate::network::ops::precomputed_gradient::precomputed_gradient;
 use crate::network::ops::spgr::spgr_on;
 #[cfg(feature = "gpu")]
-use crate::network::ops::{Array, DeviceArray};
+use crate::network::ops::{Array, TapeArray};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var, bail};
 use rayon::prelude::*;
@@ -41,7 +41,7 @@ pub struct Recomputed<'a> {
     children: Children,
     /// The same parents on the GPU that computed the children.
     #[cfg(feature = "gpu")]
-    device: Option<Scene<'a, DeviceArray>>,
+    device: Option<Scene<'a, TapeArray>>,
 }
 
 /// Gradients of one chunk.
@@ -104,7 +104,8 @@ impl Trunk {
             })
         {
             let (children, device) = result?;
-            let (trunk, device) = (self, Some(device));
+            let trunk = self;
+            let device = Some(device);
             return Ok(Recomputed { trunk, parts, scene, chunk, seed, children, device });
         }
         let outside = scene.leaves();
@@ -143,15 +144,15 @@ impl<'a> Scene<'a> {
 }
 
 #[cfg(feature = "gpu")]
-impl Scene<'_, DeviceArray> {
+impl Scene<'_, TapeArray> {
     /// Returns the same arrays, of which only the maps belong to a tape.
     fn without_parents_tape(self) -> Self {
         Self {
-            means: self.means.detached(),
-            quats_wxyz: self.quats_wxyz.detached(),
-            scales: self.scales.detached(),
-            opacities: self.opacities.detached(),
-            sh_input: self.sh_input.detached(),
+            means: self.means.detach(),
+            quats_wxyz: self.quats_wxyz.detach(),
+            scales: self.scales.detach(),
+            opacities: self.opacities.detach(),
+            sh_input: self.sh_input.detach(),
             ..self
         }
     }
@@ -194,10 +195,8 @@ impl Recomputed<'_> {
             return Ok(self.backward_on(scene, [rows, gain], wanted)?);
         }
         let zeros = |t: &Tensor| vec![0f32; t.elem_count()];
-        let mut inputs_sum: Vec<Vec<f32>> = match wanted {
-            true => inputs(&self.scene).into_iter().map(zeros).collect(),
-            false => Vec::new(),
-        };
+        let mut inputs_sum: Vec<Vec<f32>> =
+            if wanted { inputs(&self.scene).into_iter().map(zeros).collect() } else { Vec::new() };
         let maps: Vec<Tensor> =
             self.scene.prepared.iter().flat_map(|p| p.maps()).cloned().collect();
         let mut maps_sum: Vec<Vec<f32>> = maps.iter().map(zeros).collect();
@@ -237,7 +236,7 @@ impl Recomputed<'_> {
     #[cfg(feature = "gpu")]
     fn backward_on(
         &self,
-        scene: &Scene<'_, DeviceArray>,
+        scene: &Scene<'_, TapeArray>,
         [rows, gain]: [&[f32]; 2],
         wanted: bool,
     ) -> Result<Vec<Tensor>> {
@@ -248,13 +247,13 @@ impl Recomputed<'_> {
         let mut scalars = Vec::new();
         // The maps' own tape is passed once, after all chunks.
         let prepared = scene.prepared.as_ref().map(Prepared::leaves);
-        let mut of_maps: Vec<Option<DeviceArray>> =
+        let mut of_maps: Vec<Option<TapeArray>> =
             prepared.iter().flat_map(|p| p.maps()).map(|_| None).collect();
         let whole = scene;
         let scene = &Scene { prepared, ..whole.clone() };
         for span in chunks(n, scene.per_view, CHUNK_GPU) {
             let own = scene.chunk(span)?;
-            let leaf = |array: &DeviceArray| if wanted { array.leaf() } else { array.clone() };
+            let leaf = |array: &TapeArray| if wanted { array.leaf() } else { array.clone() };
             let own = ParentChunk {
                 means: leaf(&own.means),
                 quats_wxyz: leaf(&own.quats_wxyz),
@@ -264,7 +263,7 @@ impl Recomputed<'_> {
                 ..own
             };
             let leaves = [&own.means, &own.quats_wxyz, &own.scales, &own.opacities, &own.sh]
-                .map(DeviceArray::clone);
+                .map(TapeArray::clone);
             let mode = Mode::Train { seed: self.seed };
             let Records { head, parents } = self.trunk.records_of(self.parts, scene, own, mode)?;
             let part = |all: &[f32]| {
@@ -276,7 +275,7 @@ impl Recomputed<'_> {
             scalars.extend(gradients.scalars()?);
             for (sum, map) in of_maps.iter_mut().zip(scene.prepared.iter().flat_map(|p| p.maps())) {
                 *sum = match (sum.take(), gradients.of(map)) {
-                    (Some(sum), Some(own)) => Some(sum.plus(&own)?),
+                    (Some(sum), Some(own)) => Some(sum.add(&own)?),
                     (sum, own) => sum.or(own),
                 };
             }
@@ -312,9 +311,10 @@ impl Recomputed<'_> {
         let scene = self.scene.leaves();
         let own = scene.chunk(span)?;
         let leaf = |t: &Tensor| -> Result<Tensor> {
-            match wanted {
-                true => Ok(Var::from_tensor(&t.contiguous()?)?.into_inner()),
-                false => Ok(t.clone()),
+            if wanted {
+                Ok(Var::from_tensor(&t.contiguous()?)?.into_inner())
+            } else {
+                Ok(t.clone())
             }
         };
         let own = ParentChunk {
@@ -341,10 +341,8 @@ impl Recomputed<'_> {
             Some(g) => g.flatten_all()?.to_vec1::<f32>(),
             None => Ok(vec![0.0; t.elem_count()]),
         };
-        let inputs = match wanted {
-            true => leaves.iter().map(gradient).collect::<Result<_>>()?,
-            false => Vec::new(),
-        };
+        let inputs =
+            if wanted { leaves.iter().map(gradient).collect::<Result<_>>()? } else { Vec::new() };
         let deferred = scene.prepared.iter().flat_map(|p| p.deferred()).cloned().collect();
         Ok(ChunkGradients { store, inputs, deferred })
     }

@@ -5,11 +5,11 @@ use subsplat_kernels::cpu::small::expectation as cpu;
 use subsplat_kernels::cpu::small::expectation::{Expectation, MeanOver};
 
 const NAME: &str = "expectation";
-const LIFT: &str = "lift";
+const ADD_SCORES: &str = "add scores";
 
 /// Of p = softmax over `logits` `[B, D, h, w]`: (mean of the candidate index, Σ p over
-/// |k − mode| ≤ `window`), both `[B, 1, h, w]`. `mean` says over which
-/// candidates the mean is taken. The mode is a constant to gradients.
+/// |k − mode| ≤ `window`), both `[B, 1, h, w]`. `mean` selects the candidates of
+/// the mean. The mode is a constant to gradients.
 ///
 /// # Errors
 /// Another rank, no candidate, a dtype other than f32.
@@ -48,32 +48,32 @@ impl CustomOp1 for Op {
     }
 }
 
-/// logits + 4·factor·scores, `factor` `[1]`.
+/// Computes logits + 4·factor·scores, `factor` `[1]`.
 ///
 /// # Errors
 /// Shapes that differ, a dtype other than f32.
-pub fn lift(logits: &Tensor, scores: &Tensor, factor: &Tensor) -> Result<Tensor> {
+pub fn add_scores(logits: &Tensor, scores: &Tensor, factor: &Tensor) -> Result<Tensor> {
     if logits.dims() != scores.dims() || factor.dims() != [1] {
         bail!(
-            "{LIFT}: expected scores like logits {:?} and a factor [1], got {:?} and {:?}",
+            "{ADD_SCORES}: expected scores like logits {:?} and a factor [1], got {:?} and {:?}",
             logits.dims(),
             scores.dims(),
             factor.dims()
         );
     }
-    logits.contiguous()?.apply_op3(&scores.contiguous()?, factor, Lift)
+    logits.contiguous()?.apply_op3(&scores.contiguous()?, factor, AddScores)
 }
 
-/// Factor of the scores in [`lift`]: they count fourfold (`learning.md`'s network).
-pub(in crate::network::ops) const LIFT_GAIN: f32 = 4.0;
+/// Gain of the scores in [`add_scores`]: they count fourfold (`learning.md`'s network).
+pub(in crate::network::ops) const SCORE_GAIN: f32 = 4.0;
 /// Elements per task.
 const CHUNK: usize = 16_384;
 
-struct Lift;
+struct AddScores;
 
-impl CustomOp3 for Lift {
+impl CustomOp3 for AddScores {
     fn name(&self) -> &'static str {
-        LIFT
+        ADD_SCORES
     }
 
     fn cpu_fwd(
@@ -85,9 +85,9 @@ impl CustomOp3 for Lift {
         s3: &CpuStorage,
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let logits = slice::<f32>(LIFT, "logits", s1, l1)?;
-        let scores = slice::<f32>(LIFT, "scores", s2, l2)?;
-        let gain = LIFT_GAIN * slice::<f32>(LIFT, "factor", s3, l3)?.iter().sum::<f32>();
+        let logits = slice::<f32>(ADD_SCORES, "logits", s1, l1)?;
+        let scores = slice::<f32>(ADD_SCORES, "scores", s2, l2)?;
+        let gain = SCORE_GAIN * slice::<f32>(ADD_SCORES, "factor", s3, l3)?.iter().sum::<f32>();
         let mut y = vec![0.0; logits.len()];
         let parts = logits.par_chunks(CHUNK).zip(scores.par_chunks(CHUNK));
         parts.zip(y.par_chunks_mut(CHUNK)).for_each(|((a, b), y)| {
@@ -105,9 +105,9 @@ impl CustomOp3 for Lift {
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let dy = dy.contiguous()?;
-        let gain = LIFT_GAIN * factor.flatten_all()?.to_vec1::<f32>()?.iter().sum::<f32>();
+        let gain = SCORE_GAIN * factor.flatten_all()?.to_vec1::<f32>()?.iter().sum::<f32>();
         let mut d_scores = vec![0.0; scores.elem_count()];
-        let sums: Vec<f64> = borrowed(LIFT, [scores, &dy], |[x, dy]: [&[f32]; 2]| {
+        let sums: Vec<f64> = borrowed(ADD_SCORES, [scores, &dy], |[x, dy]: [&[f32]; 2]| {
             let parts = x.par_chunks(CHUNK).zip(dy.par_chunks(CHUNK));
             let parts = parts.zip(d_scores.par_chunks_mut(CHUNK));
             let one = |((x, dy), dx): ((&[f32], &[f32]), &mut [f32])| {
@@ -116,7 +116,7 @@ impl CustomOp3 for Lift {
             };
             parts.map(one).collect()
         })?;
-        let d_factor = (f64::from(LIFT_GAIN) * sums.iter().sum::<f64>()) as f32;
+        let d_factor = (f64::from(SCORE_GAIN) * sums.iter().sum::<f64>()) as f32;
         let d_factor = Tensor::from_vec(vec![d_factor], 1, factor.device())?;
         Ok((Some(dy), Some(tensor_like(d_scores, scores)?), Some(d_factor)))
     }

@@ -31,7 +31,8 @@ pub fn head_input(
     confidence: &Tensor,
     share: f32,
 ) -> Result<Tensor> {
-    let ((b, c, fh, fw), (_, _, h, w)) = (features.dims4()?, rgb.dims4()?);
+    let (b, c, fh, fw) = features.dims4()?;
+    let (_, _, h, w) = rgb.dims4()?;
     expect(INPUT, "picture", rgb, &[b, 3, h, w])?;
     expect(INPUT, "index", index, &[b, 1, h, w])?;
     expect(INPUT, "confidence", confidence, &[b, 1, h, w])?;
@@ -93,7 +94,7 @@ impl CustomOp3 for Before {
     }
 }
 
-/// Where raw rows start, and how opacity comes about.
+/// Initial values of the raw rows, and the formula of the opacity.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Start {
     /// `[R]`: added to every raw row.
@@ -117,7 +118,8 @@ pub fn head_output(
     rgb: &Tensor,
     start: Start,
 ) -> Result<(Tensor, Tensor)> {
-    let ((b, _, h, w), r) = (x.dims4()?, start.row.len());
+    let (b, _, h, w) = x.dims4()?;
+    let r = start.row.len();
     expect(OUTPUT, "channels", x, &[b, r + 1, h, w])?;
     expect(OUTPUT, "picture", rgb, &[b, 3, h, w])?;
     expect(OUTPUT, "confidence", confidence, &[b, 1, h, w])?;
@@ -135,9 +137,9 @@ pub fn head_output(
     Ok((opacity.apply_op1(raw)?, opacity))
 }
 
-/// One op with two results: candle's ops have one. [`Raw`] hangs on [`Opacity`], so it
-/// goes backward first, and leaves its gradient here; [`Opacity`] hangs on the
-/// convolution and takes both back in one pass.
+/// Gradient of the raw rows. candle's operations have one result each; this one has two. The input of
+/// [`Raw`] is the result of [`Opacity`], so the backward pass of `Raw` runs first. It stores its
+/// gradient here, and the backward pass of `Opacity` computes the gradient of both.
 type Slot = Arc<Mutex<Option<Tensor>>>;
 
 struct Opacity {

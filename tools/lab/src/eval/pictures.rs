@@ -7,7 +7,7 @@ use std::ops::ControlFlow;
 use subsplat::files::image::Rgb;
 use subsplat::finish::{FitOptions, Refiner};
 use subsplat::network::config::LowpassRef;
-use subsplat::network::model::encoding::SceneEncoding;
+use subsplat::network::model::scene_encoding::SceneEncoding;
 use subsplat::network::model::subsplat::feature_channels;
 use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;

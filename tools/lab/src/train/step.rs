@@ -19,7 +19,7 @@ use subsplat::network::config::{Backbone, Config};
 use subsplat::network::model::backbone::small::{DepthMaps, DisparityMean};
 use subsplat::network::model::primaries::packed;
 use subsplat::network::model::subsplat::SubSplat;
-use subsplat::network::model::traced::Traced;
+use subsplat::network::model::taped::Taped;
 use subsplat::network::model::trunk::{Children, TrainPass};
 use subsplat::network::model::weights::Weights;
 use subsplat::network::model::{BackboneOutput, Views};
@@ -392,7 +392,7 @@ impl Learner {
         views: &Views,
         share: f64,
         seconds: &mut Seconds,
-    ) -> Result<(Traced<Tensor>, Terms)> {
+    ) -> Result<(Taped<Tensor>, Terms)> {
         let start = Instant::now();
         let maps = model.depth_maps(views, self.disparity_mean())?;
         seconds.backbone += start.elapsed().as_secs_f64();
@@ -462,7 +462,7 @@ impl Learner {
         scale: StepScale,
         mut sink: GradientSink<'_>,
         seconds: &mut Seconds,
-    ) -> Result<(Traced<Tensor>, Terms)> {
+    ) -> Result<(Taped<Tensor>, Terms)> {
         let start = Instant::now();
         let encoded = model.encode_for_training(views, self.disparity_mean())?;
         let (output, maps) = &encoded.value;

@@ -158,20 +158,20 @@ impl Head {
             }
             Form::Coord { norm, lin0, lin1, pos } => {
                 let x = affine(lin0, &norm.forward(x)?)?;
-                let positions = x.constant(posenc(k), &[k, POSENC])?;
+                let positions = x.new_tensor(posenc(k), &[k, POSENC])?;
                 let positions = affine_then(&pos[0], &positions, Activation::Gelu)?;
                 let positions = affine(&pos[1], &positions)?;
                 // One child at a time, so that no tensor [n, K, hidden] exists.
                 let child = |i: usize| {
-                    let hidden = x.plus_then(&positions.narrow(0, i, 1)?, Activation::Gelu)?;
+                    let hidden = x.add_activation(&positions.narrow(0, i, 1)?, Activation::Gelu)?;
                     affine(lin1, &hidden)
                 };
                 let children = (0..k).map(child).collect::<Result<Vec<_>>>()?;
-                A::joined(&children.iter().collect::<Vec<_>>(), 1)?
+                A::cat(&children.iter().collect::<Vec<_>>(), 1)?
             }
             Form::Polynomial { .. } => return self.for_children(k)?.forward(x, k),
         };
-        if out.count() != n * k * self.outputs {
+        if out.elem_count() != n * k * self.outputs {
             let expected = k * self.outputs;
             bail!("head: expected {expected} outputs for {k} children, got {:?}", out.dims());
         }
@@ -264,14 +264,15 @@ impl Heads {
         let appearance = self.appearance.forward(&inputs.appearance, children)?;
         let [n, k, outputs] = geometry.sizes()?;
         let rest = appearance.reshape((n * k, ()))?;
-        let flat = geometry.reshape((n * k, outputs))?.columns(&rest, None)?;
+        let flat = geometry.reshape((n * k, outputs))?.cat_columns(&rest, None)?;
         flat.reshape((n, k, HEAD_STRIDE))
     }
 }
 
 /// Returns the constants of the fused op for `config` and K = `k`.
 pub fn rules(config: &Config, k: usize) -> Rules {
-    let (s, ablations) = (&config.spgr, &config.spgr.ablations);
+    let s = &config.spgr;
+    let ablations = &config.spgr.ablations;
     let positions = Positions::new(k);
     let a_min = match ablations.a_min {
         AMin::OverK if k == 1 => 0.0,

@@ -9,7 +9,7 @@ use super::DeviceParents;
 use super::{Parts, Records, Scene, Span, Trunk};
 use crate::network::model::geometry::ParentChunk;
 use crate::network::model::mlp::Mode;
-use crate::network::model::spgr::rules;
+use crate::network::model::spgr_heads::rules;
 use crate::network::model::trace::Checkpoint;
 use crate::network::model::{BackboneOutput, Primaries, Views};
 use crate::network::ops::Array;
@@ -106,9 +106,10 @@ impl Trunk {
             bail!("numbers of children: expected one for each of {expected} parents, got {got}");
         }
         let groups = groups(counts, per_view, self.chunk_size());
-        let made = match groups.iter().any(|group| group.children > 1) {
-            true => made(&groups)?,
-            false => groups.iter().map(|_| Made::default()).collect(),
+        let made = if groups.iter().any(|group| group.children > 1) {
+            made(&groups)?
+        } else {
+            groups.iter().map(|_| Made::default()).collect()
         };
         Ok(assembled(parents, counts, &groups, &made))
     }
@@ -168,9 +169,10 @@ impl Trunk {
                 checkpoint()
             };
             let of_count = |(group, _): &(&Group, &mut Made)| group.children == children;
-            match self.backend.is_cpu() {
-                true => groups.par_iter().zip(&mut made).filter(of_count).try_for_each(run)?,
-                false => groups.iter().zip(&mut made).filter(of_count).try_for_each(run)?,
+            if self.backend.is_cpu() {
+                groups.par_iter().zip(&mut made).filter(of_count).try_for_each(run)?
+            } else {
+                groups.iter().zip(&mut made).filter(of_count).try_for_each(run)?
             }
         }
         Ok(made)
@@ -185,7 +187,7 @@ impl Trunk {
     ) -> Result<Made> {
         let first = group.indices.first().map_or(0, |i| *i as usize);
         let view = first / scene.per_view.max(1);
-        let chosen = |t: &A| t.selected(0, &group.indices);
+        let chosen = |t: &A| t.index_select(&group.indices, 0);
         let own = ParentChunk {
             first,
             source: view,

@@ -5,7 +5,7 @@
 //! that the bytes depend on the operations alone. A rule owns the arrays it needs and is dropped
 //! once it has run, so that their memory returns to the pool during the pass.
 
-use super::{DeviceArray, Executor, OnDevice};
+use super::{Executor, OnDevice, TapeArray};
 use crate::network::ops::precomputed_gradient::precomputed_gradient;
 use candle_core::{Result, Tensor, bail};
 use std::collections::BTreeMap;
@@ -64,7 +64,7 @@ impl Executor {
     /// other sizes; errors of the device.
     pub fn backward(
         self: &Arc<Self>,
-        results: &[(&DeviceArray, &DeviceArray)],
+        results: &[(&TapeArray, &TapeArray)],
     ) -> Result<DeviceGradients> {
         let mut open: BTreeMap<u64, (Arc<Node>, gpu::DeviceArray)> = BTreeMap::new();
         let mut leaves = BTreeMap::new();
@@ -119,7 +119,7 @@ impl Executor {
     }
 }
 
-impl DeviceArray {
+impl TapeArray {
     /// Returns the executor of the array.
     pub fn executor(&self) -> &Arc<Executor> {
         &self.executor
@@ -153,19 +153,18 @@ impl DeviceArray {
     {
         let array = self.executor.checked(result)?;
         let tracked = inputs.map(|input| input.node.is_some());
-        let node = match tracked.contains(&true) {
-            true => {
-                let rule = rule(tracked, &array);
-                let rule: Rule = Box::new(move |dy| Ok(rule(dy)?.into()));
-                let inputs = inputs.iter().map(|input| input.node.clone()).collect();
-                self.executor.node(Origin::Operation { name, inputs, rule: Mutex::new(Some(rule)) })
-            }
-            false => None,
+        let node = if tracked.contains(&true) {
+            let rule = rule(tracked, &array);
+            let rule: Rule = Box::new(move |dy| Ok(rule(dy)?.into()));
+            let inputs = inputs.iter().map(|input| input.node.clone()).collect();
+            self.executor.node(Origin::Operation { name, inputs, rule: Mutex::new(Some(rule)) })
+        } else {
+            None
         };
         Ok(Self { array, executor: self.executor.clone(), node })
     }
 
-    /// [`DeviceArray::recorded`] for an operation of this array alone; `rule` receives this array
+    /// [`TapeArray::recorded`] for an operation of this array alone; `rule` receives this array
     /// and the result.
     pub(super) fn recorded_alone<R>(
         &self,
@@ -182,7 +181,7 @@ impl DeviceArray {
         })
     }
 
-    /// [`DeviceArray::recorded`] for any number of inputs; `rule` computes the gradient of the
+    /// [`TapeArray::recorded`] for any number of inputs; `rule` computes the gradient of the
     /// input with a given index.
     pub(super) fn recorded_parts(
         &self,
@@ -194,18 +193,14 @@ impl DeviceArray {
         let array = self.executor.checked(result)?;
         let inputs: Vec<_> = inputs.iter().map(|input| input.node.clone()).collect();
         let tracked: Vec<bool> = inputs.iter().map(Option::is_some).collect();
-        let node = match tracked.contains(&true) {
-            true => {
-                let rule: Rule = Box::new(move |dy| {
-                    let one = |(i, wanted): (usize, &bool)| match wanted {
-                        true => rule(dy, i).map(Some),
-                        false => Ok(None),
-                    };
-                    tracked.iter().enumerate().map(one).collect()
-                });
-                self.executor.node(Origin::Operation { name, inputs, rule: Mutex::new(Some(rule)) })
-            }
-            false => None,
+        let node = if tracked.contains(&true) {
+            let rule: Rule = Box::new(move |dy| {
+                let one = |(i, wanted): (usize, &bool)| wanted.then(|| rule(dy, i)).transpose();
+                tracked.iter().enumerate().map(one).collect()
+            });
+            self.executor.node(Origin::Operation { name, inputs, rule: Mutex::new(Some(rule)) })
+        } else {
+            None
         };
         Ok(Self { array, executor: self.executor.clone(), node })
     }
@@ -213,9 +208,9 @@ impl DeviceArray {
 
 impl DeviceGradients {
     /// Returns the gradient of a leaf; `None` where no gradient reached it.
-    pub fn of(&self, leaf: &DeviceArray) -> Option<DeviceArray> {
+    pub fn of(&self, leaf: &TapeArray) -> Option<TapeArray> {
         let (_, array) = self.leaves.get(&leaf.node.as_ref()?.number)?;
-        Some(DeviceArray { array: array.clone(), executor: self.executor.clone(), node: None })
+        Some(TapeArray { array: array.clone(), executor: self.executor.clone(), node: None })
     }
 
     /// Returns for each leaf that is a copy of a tensor of candle's graph a scalar, whose gradient

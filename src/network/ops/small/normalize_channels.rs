@@ -2,14 +2,14 @@ use crate::network::ops::{borrowed, output, slice, tensor_like};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use subsplat_kernels::cpu::small::unit as cpu;
 
-const NAME: &str = "unit channels";
+const NAME: &str = "normalize channels";
 
 /// `x` `[B, C, h, w]` with the channels of each pixel scaled to unit length (1e-8 added
 /// to its square).
 ///
 /// # Errors
 /// Another rank, an empty tensor, a dtype other than f32.
-pub fn unit_channels(x: &Tensor) -> Result<Tensor> {
+pub fn normalize_channels(x: &Tensor) -> Result<Tensor> {
     let (b, c, h, w) = x.dims4()?;
     if b * c * h * w == 0 {
         bail!("{NAME}: expected sizes of at least 1, got {:?}", x.dims());

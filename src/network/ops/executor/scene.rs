@@ -3,7 +3,7 @@
 //! CPU versions: [`crate::network::ops::adapter`], [`crate::network::ops::spgr`], [`crate::network::ops::rasterize`]. Tests:
 //! tests/gpu/primaries.rs, tests/gpu/model.rs.
 
-use super::{DeviceArray, Executor};
+use super::{Executor, TapeArray};
 use crate::network::ops::adapter::{Adapter, Turn, View};
 use crate::network::ops::check_raster_options;
 use crate::network::ops::spgr::Spgr;
@@ -14,7 +14,7 @@ use subsplat_kernels::gpu;
 use subsplat_kernels::gpu::{AdapterCall, AdapterView, SceneArrays};
 use subsplat_kernels::layout::RasterOptions;
 
-/// SH of primaries in device memory ([`DeviceArray::placed_colours`]).
+/// SH of primaries in device memory ([`TapeArray::placed_colours`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ColourLayout {
     /// World frame, `[N, D, 3]`.
@@ -29,11 +29,11 @@ pub enum ColourLayout {
 #[derive(Clone, Debug)]
 pub struct DeviceSplats {
     /// `[n·K, 11]`, columns as in [`subsplat_kernels::layout`].
-    pub rows: DeviceArray,
+    pub rows: TapeArray,
     /// `[n, D, 3]`: the parents' SH, world frame.
-    pub sh: DeviceArray,
+    pub sh: TapeArray,
     /// `[n·K, 1]` or `[n·K, 4]`; `None` for gains of 1.
-    pub gain: Option<DeviceArray>,
+    pub gain: Option<TapeArray>,
 }
 
 fn call(adapter: &Adapter) -> AdapterCall {
@@ -60,7 +60,7 @@ fn constants(view: &View) -> AdapterView {
     }
 }
 
-impl DeviceArray {
+impl TapeArray {
     /// Computes packed rows `[N, 11]` of raw head rows `[…, 9 + 3·D]`, `depths` and `densities`
     /// `[…, G]` ([`crate::network::ops::adapter::place`]).
     ///
@@ -74,7 +74,7 @@ impl DeviceArray {
     /// Computes the SH of the same head rows.
     ///
     /// # Errors
-    /// Those of [`DeviceArray::placed`].
+    /// Those of [`TapeArray::placed`].
     pub fn placed_colours(&self, adapter: &Adapter, layout: ColourLayout) -> Result<Self> {
         let dense = |turn: &Turn| turn.dense().into_iter().map(|v| v as f32);
         let matrices: Vec<f32> = match layout {
@@ -104,7 +104,7 @@ impl Executor {
     ///
     /// # Errors
     /// Errors of the device.
-    pub fn read(&self, arrays: &[&DeviceArray]) -> Result<Vec<Tensor>> {
+    pub fn read(&self, arrays: &[&TapeArray]) -> Result<Vec<Tensor>> {
         let own: Vec<_> = arrays.iter().map(|a| &a.array).collect();
         let values = self.checked(self.recorder.read(&own))?.into_iter().zip(&own);
         values.map(|(v, array)| Tensor::from_vec(v, array.dims(), &Device::Cpu)).collect()

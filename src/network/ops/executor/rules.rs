@@ -1,7 +1,7 @@
 //! Rules of gradients that several operations share, arguments of kernels, and the gradient of the
 //! children.
 
-use super::{DeviceArray, DeviceGradients, OnDevice};
+use super::{DeviceGradients, OnDevice, TapeArray};
 use crate::network::ops::Array;
 use crate::network::ops::activation::Activation;
 use crate::network::ops::attention::{Labels, PENALTY};
@@ -36,7 +36,7 @@ pub(super) fn camera_floats(cameras: &[Vec<Camera>]) -> Vec<f32> {
     cameras.iter().flatten().flat_map(floats).collect()
 }
 
-impl DeviceArray {
+impl TapeArray {
     pub(super) fn of(&self, result: OnDevice<gpu::DeviceArray>) -> Result<Self> {
         self.executor.array(result)
     }
@@ -53,9 +53,9 @@ impl DeviceArray {
         compute: impl FnOnce(PointwiseFunction) -> OnDevice<gpu::DeviceArray>,
     ) -> Result<Self> {
         // Without a bias, an array without a node takes its place.
-        let none = weight.detached();
+        let none = weight.detach();
         let bias = bias.unwrap_or(&none);
-        let tracked = [self, weight, bias].into_iter().any(Self::is_tracked);
+        let tracked = [self, weight, bias].into_iter().any(Self::track_op);
         let (within, after) = if tracked { (None, activation) } else { (activation, None) };
         let result = compute(pointwise(within));
         let ProductRules { input, weight: of_weight, channel } = rules;
@@ -76,7 +76,7 @@ impl DeviceArray {
             }
         })?;
         match after {
-            Some(kind) => product.activated(kind),
+            Some(kind) => product.activate(kind),
             None => Ok(product),
         }
     }
@@ -95,14 +95,15 @@ impl DeviceArray {
         R: FnOnce(&gpu::DeviceArray) -> OnDevice<[gpu::DeviceArray; 3]> + Send + Sync + 'static,
     {
         // Without a residual, an array without a node takes its place.
-        let none = self.detached();
+        let none = self.detach();
         let inputs = [self, factors, summands, residual.unwrap_or(&none)];
         self.recorded(name, result, inputs, |want, _| {
             let rule = rule();
             move |dy| {
-                let [dx, of_factors, of_summands] = match want[..3].contains(&true) {
-                    true => rule(dy)?.map(Some),
-                    false => [None, None, None],
+                let [dx, of_factors, of_summands] = if want[..3].contains(&true) {
+                    rule(dy)?.map(Some)
+                } else {
+                    [None, None, None]
                 };
                 Ok([
                     dx.filter(|_| want[0]),
@@ -149,7 +150,7 @@ impl DeviceArray {
     ) -> Result<DeviceGradients> {
         let upload = |values: Vec<f32>| {
             let dims = [values.len()];
-            self.constant(values, &dims)
+            self.new_tensor(values, &dims)
         };
         let (rows, gains) = (upload(rows)?, upload(gains)?);
         let args = call.on_gpu(&[], &[]);
@@ -165,7 +166,7 @@ impl DeviceArray {
     }
 
     /// Computes √x.
-    pub(super) fn square_root(&self) -> Result<Self> {
+    pub(super) fn sqrt(&self) -> Result<Self> {
         self.recorded_alone("square root", self.array.map(Function::SquareRoot), |_, y| {
             let y = y.clone();
             move |dy| scaled(&dy.with(&y, Function::Over)?, 0.5)

@@ -1,14 +1,14 @@
 //! Results of the backbone for training, on either executor.
 //!
 //! On a GPU the results are copies in host memory, and leaves of candle's graph. candle's backward
-//! pass ends at them; [`Traced::backward`] continues it on the device.
+//! pass ends at them; [`Taped::backward`] continues it on the device.
 
 #[cfg(feature = "gpu")]
 use super::BackboneOutput;
 #[cfg(feature = "gpu")]
 use super::backbone::small::DepthMaps;
 #[cfg(feature = "gpu")]
-use crate::network::ops::{Array, DeviceArray, Executor};
+use crate::network::ops::{Array, Executor, TapeArray};
 #[cfg(feature = "gpu")]
 use candle_core::Var;
 use candle_core::backprop::GradStore;
@@ -17,7 +17,7 @@ use candle_core::{Result, Tensor};
 use std::sync::Arc;
 
 /// Tensors of a forward pass, and its tape where a GPU computed them.
-pub struct Traced<T> {
+pub struct Taped<T> {
     /// The tensors.
     pub value: T,
     #[cfg(feature = "gpu")]
@@ -28,10 +28,10 @@ pub struct Traced<T> {
 #[cfg(feature = "gpu")]
 pub(super) struct Tape {
     executor: Arc<Executor>,
-    results: Vec<(Var, DeviceArray)>,
+    results: Vec<(Var, TapeArray)>,
 }
 
-impl<T> Traced<T> {
+impl<T> Taped<T> {
     /// Returns tensors whose graph is candle's.
     pub(super) fn on_host(value: T) -> Self {
         Self {
@@ -48,8 +48,8 @@ impl<T> Traced<T> {
     }
 
     /// Replaces the tensors, with which the tape stays.
-    pub fn map<U>(self, f: impl FnOnce(T) -> U) -> Traced<U> {
-        Traced {
+    pub fn map<U>(self, f: impl FnOnce(T) -> U) -> Taped<U> {
+        Taped {
             value: f(self.value),
             #[cfg(feature = "gpu")]
             tape: self.tape,
@@ -79,10 +79,10 @@ impl Tape {
     }
 
     /// Copies a result to host memory.
-    pub(super) fn copy(&mut self, result: &DeviceArray) -> Result<Tensor> {
+    pub(super) fn copy(&mut self, result: &TapeArray) -> Result<Tensor> {
         let leaf = Var::from_tensor(&result.to_host()?)?;
         let tensor = leaf.as_tensor().clone();
-        if result.is_tracked() {
+        if result.track_op() {
             self.results.push((leaf, result.clone()));
         }
         Ok(tensor)
@@ -101,7 +101,7 @@ impl Tape {
 }
 
 #[cfg(feature = "gpu")]
-impl BackboneOutput<DeviceArray> {
+impl BackboneOutput<TapeArray> {
     /// Returns copies in host memory that `tape` knows.
     pub(super) fn copied(&self, tape: &mut Tape) -> Result<BackboneOutput> {
         let features = self.features.iter().map(|(level, map)| Ok((*level, tape.copy(map)?)));
@@ -115,7 +115,7 @@ impl BackboneOutput<DeviceArray> {
 }
 
 #[cfg(feature = "gpu")]
-impl DepthMaps<DeviceArray> {
+impl DepthMaps<TapeArray> {
     /// Returns copies in host memory that `tape` knows.
     pub(super) fn copied(&self, tape: &mut Tape) -> Result<DepthMaps> {
         Ok(DepthMaps {

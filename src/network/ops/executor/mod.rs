@@ -9,6 +9,7 @@ mod adam;
 mod array;
 mod rules;
 mod scene;
+mod small_array;
 mod tape;
 
 pub use adam::{DeviceAdam, ParameterStep, SharedStep};
@@ -54,8 +55,13 @@ impl Executor {
     /// Returns an executor on the GPU of `backend`, if it is one.
     pub fn new(backend: &Backend) -> Option<Arc<Self>> {
         let recorder = Recorder::new(backend.gpu()?.clone());
-        let (parameters, trained, failure, nodes) = Default::default();
-        Some(Arc::new(Self { recorder, parameters, trained, failure, nodes }))
+        Some(Arc::new(Self {
+            recorder,
+            parameters: Mutex::default(),
+            trained: Mutex::default(),
+            failure: Mutex::default(),
+            nodes: AtomicU64::default(),
+        }))
     }
 
     /// Runs `f`, one pass of the network. `None`: the device failed, and `backend` knows the
@@ -96,18 +102,18 @@ impl Executor {
     ///
     /// # Errors
     /// Another dtype; errors of the device.
-    pub fn upload(self: &Arc<Self>, tensor: &Tensor) -> Result<DeviceArray> {
+    pub fn upload(self: &Arc<Self>, tensor: &Tensor) -> Result<TapeArray> {
         let values = tensor.flatten_all()?.to_vec1::<f32>()?;
         let array = self.array(self.recorder.upload(&values, tensor.dims()))?;
-        Ok(match tensor.track_op() {
-            true => array.with_leaf(Some(tensor.clone())),
-            false => array,
-        })
+        if tensor.track_op() {
+            return Ok(array.with_leaf(Some(tensor.clone())));
+        }
+        Ok(array)
     }
 
-    fn array(self: &Arc<Self>, result: OnDevice<gpu::DeviceArray>) -> Result<DeviceArray> {
+    fn array(self: &Arc<Self>, result: OnDevice<gpu::DeviceArray>) -> Result<TapeArray> {
         let array = self.checked(result)?;
-        Ok(DeviceArray { array, executor: self.clone(), node: None })
+        Ok(TapeArray { array, executor: self.clone(), node: None })
     }
 
     /// Keeps the first error of the device for [`Executor::attempt`].
@@ -121,7 +127,7 @@ impl Executor {
 
     /// Returns `parameter` on the device, where it is kept unless its values can change outside
     /// [`Executor::keep_trained`].
-    fn parameter(self: &Arc<Self>, parameter: &Tensor) -> Result<DeviceArray> {
+    fn parameter(self: &Arc<Self>, parameter: &Tensor) -> Result<TapeArray> {
         if parameter.track_op() {
             let trained = self.trained.lock().unwrap_or_else(PoisonError::into_inner);
             return match trained.get(&parameter.id()) {
@@ -139,7 +145,7 @@ impl Executor {
         let now = kept.pass;
         if let Some((used, array)) = kept.arrays.get_mut(&parameter.id()) {
             *used = now;
-            return Ok(DeviceArray { array: array.clone(), executor: self.clone(), node: None });
+            return Ok(TapeArray { array: array.clone(), executor: self.clone(), node: None });
         }
         let uploaded = self.upload(parameter)?;
         kept.arrays.insert(parameter.id(), (now, uploaded.array.clone()));
@@ -147,9 +153,9 @@ impl Executor {
     }
 }
 
-/// An array in the memory of an [`Executor`]'s GPU.
+/// An array in the memory of an [`Executor`]'s GPU, with its place on the tape of gradients.
 #[derive(Clone, Debug)]
-pub struct DeviceArray {
+pub struct TapeArray {
     array: gpu::DeviceArray,
     executor: Arc<Executor>,
     /// The operation that made the array, where a gradient must reach it.

@@ -4,7 +4,7 @@
 //! [`ADAM_BLOCK`]. The network reads these parts without an upload ([`Executor::keep_trained`]).
 //! Tests: tests/gpu/optimizer.rs.
 
-use super::{DeviceArray, Executor};
+use super::{Executor, TapeArray};
 use crate::network::ops::Array;
 use candle_core::{Result, Tensor, bail};
 use std::ops::Range;
@@ -20,7 +20,7 @@ pub struct DeviceAdam {
     /// Parameter of each block.
     owners: Vec<u32>,
     /// Values, first moments, second moments, averages.
-    state: [DeviceArray; 4],
+    state: [TapeArray; 4],
 }
 
 /// Constants of a step ([`subsplat_kernels::cpu::adam::AdamStep`]) that all parameters share.
@@ -70,7 +70,7 @@ impl DeviceAdam {
     ///
     /// # Errors
     /// Dimensions of another number of elements.
-    pub fn value(&self, index: usize, dims: &[usize]) -> Result<DeviceArray> {
+    pub fn value(&self, index: usize, dims: &[usize]) -> Result<TapeArray> {
         let Some(span) = self.spans.get(index) else {
             bail!("parameter: expected an index below {}, got {index}", self.spans.len())
         };
@@ -134,7 +134,7 @@ impl Executor {
     ///
     /// # Errors
     /// An array of other dimensions than its tensor.
-    pub fn keep_trained(&self, parameters: &[(Tensor, DeviceArray)]) -> Result<()> {
+    pub fn keep_trained(&self, parameters: &[(Tensor, TapeArray)]) -> Result<()> {
         if let Some((tensor, array)) = parameters.iter().find(|(t, a)| t.dims() != a.dims()) {
             bail!("parameter: expected an array {:?}, got {:?}", tensor.dims(), array.dims());
         }
@@ -146,7 +146,7 @@ impl Executor {
 
 /// Copies an array without gaps to the device, each parameter from a multiple of [`ADAM_BLOCK`] on;
 /// gaps are 0.
-fn upload(executor: &Arc<Executor>, spans: &[Range<usize>], row: &[f32]) -> Result<DeviceArray> {
+fn upload(executor: &Arc<Executor>, spans: &[Range<usize>], row: &[f32]) -> Result<TapeArray> {
     let expected = spans.last().map_or(0, |span| span.end);
     if row.len() != expected {
         bail!("optimizer: expected {expected} elements, got {}", row.len());

@@ -12,7 +12,7 @@ use super::trunk::DeviceParents;
 use super::trunk::{MixedChildren, Trunk};
 use super::{BackboneOutput, Primaries, Views};
 #[cfg(feature = "gpu")]
-use crate::network::ops::{Array, DeviceArray};
+use crate::network::ops::{Array, TapeArray};
 use crate::scene::splats::Splats;
 use candle_core::{Result, Tensor, bail};
 use subsplat_kernels::camera::Camera;
@@ -33,7 +33,7 @@ pub struct SceneEncoding {
 enum Output {
     Host(BackboneOutput),
     #[cfg(feature = "gpu")]
-    Device(BackboneOutput<DeviceArray>),
+    Device(BackboneOutput<TapeArray>),
 }
 
 enum Place {
@@ -68,7 +68,7 @@ impl SubSplat {
             let images = executor.upload(&views.images)?;
             let output = self.encode_on(views, &images, &mut Trace::with_checkpoint(checkpoint))?;
             // Inference needs no tape, and the trunk not all maps.
-            let mut output = output.map(|array| Ok(array.detached()))?;
+            let mut output = output.map(|array| Ok(array.detach()))?;
             output.features.retain(|(level, _)| self.trunk().reads(*level));
             if waits {
                 executor.finish()?;
@@ -175,7 +175,8 @@ impl SceneEncoding {
             #[cfg(feature = "gpu")]
             Place::Device(parents) => {
                 let made = network.trunk().on_device(|executor| {
-                    let (trunk, steps) = (network.trunk(), (checkpoint, true));
+                    let trunk = network.trunk();
+                    let steps = (checkpoint, true);
                     let children = trunk.device_children(&self.views, parents, steps)?;
                     let (children, depths) = children.to_host(executor, &[&parents.depths])?;
                     let finite = |t: &Tensor| -> Result<bool> {

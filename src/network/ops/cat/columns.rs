@@ -1,21 +1,20 @@
-//! Up to three matrices' columns beside one another as a candle op with gradients;
-//! candle's `cat` takes its gradient apart element by element. Tests:
+//! Columns of two or three matrices as a candle op with gradients. Tests:
 //! tests/network/trunk_parts.rs.
 
-use super::{Number, borrowed, by_dtype, slice};
+use crate::network::ops::{Number, borrowed, by_dtype, slice};
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
-const NAME: &str = "columns";
+const NAME: &str = "cat columns";
 /// Rows per task.
 const BLOCK: usize = 256;
 
-/// `[n, a]`, `[n, b]` and, if there is one, `[n, c]` to `[n, a + b + c]`; f32 or f64.
+/// Concatenates `[n, a]`, `[n, b]` and, if there is one, `[n, c]` to `[n, a + b + c]`; f32 or f64.
 ///
 /// # Errors
 /// Another rank, another number of rows, no columns at all, mixed dtypes.
-pub fn columns(first: &Tensor, second: &Tensor, third: Option<&Tensor>) -> Result<Tensor> {
+pub fn cat_columns(first: &Tensor, second: &Tensor, third: Option<&Tensor>) -> Result<Tensor> {
     let (n, a) = first.dims2()?;
     let (m, b) = second.dims2()?;
     let (k, c) = third.map_or(Ok((n, 0)), Tensor::dims2)?;
@@ -32,7 +31,7 @@ pub fn columns(first: &Tensor, second: &Tensor, third: Option<&Tensor>) -> Resul
 /// Widths.
 struct Columns([usize; 3]);
 
-fn join<T: Number>(
+fn concatenated<T: Number>(
     widths: [usize; 3],
     rows: usize,
     parts: &[(&CpuStorage, &Layout)],
@@ -60,7 +59,8 @@ fn part<T: Number>(dy: &Tensor, like: &Tensor, first: usize) -> Result<Option<Te
     if !like.track_op() {
         return Ok(None);
     }
-    let ((_, width), (_, w)) = (dy.dims2()?, like.dims2()?);
+    let (_, width) = dy.dims2()?;
+    let (_, w) = like.dims2()?;
     let mut dx = vec![T::default(); like.elem_count()];
     borrowed::<T, _, 1>(NAME, [dy], |[dy]| {
         let blocks = dx.par_chunks_mut((BLOCK * w).max(1)).zip(dy.par_chunks(BLOCK * width));
@@ -99,7 +99,7 @@ impl CustomOp2 for Columns {
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let parts = [(s1, l1), (s2, l2)];
-        by_dtype!(NAME, s1.dtype(), join(self.0, l1.dims()[0], &parts))
+        by_dtype!(NAME, s1.dtype(), concatenated(self.0, l1.dims()[0], &parts))
     }
 
     fn bwd(
@@ -129,7 +129,7 @@ impl CustomOp3 for Columns {
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let parts = [(s1, l1), (s2, l2), (s3, l3)];
-        by_dtype!(NAME, s1.dtype(), join(self.0, l1.dims()[0], &parts))
+        by_dtype!(NAME, s1.dtype(), concatenated(self.0, l1.dims()[0], &parts))
     }
 
     fn bwd(

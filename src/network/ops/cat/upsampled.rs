@@ -1,22 +1,22 @@
-//! Two maps' channels beside one another as a candle op with gradients; candle's `cat`
-//! copies on one thread, and its backward adds into strided views. Kernel:
-//! [`subsplat_kernels::cpu::join`]. Tests: `small/tests.rs`.
+//! Channels of two maps as a candle op with gradients, the second upsampled. Kernel:
+//! [`subsplat_kernels::cpu::join`]. Tests: tests/network/operators/small.rs.
 
-use super::{borrowed, output, slice, tensor_like};
+use crate::network::ops::{borrowed, output, slice, tensor_like};
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use subsplat_kernels::cpu::join as cpu;
 use subsplat_kernels::cpu::join::Join;
 use subsplat_kernels::cpu::zeros;
 
-const NAME: &str = "join";
+const NAME: &str = "cat upsampled";
 
-/// `[B, C₁, h, w]` beside `[B, C₂, h/s, w/s]`, each of whose pixels is repeated s × s
-/// times: `[B, C₁ + C₂, h, w]`.
+/// Concatenates the channels of `[B, C₁, h, w]` and of `[B, C₂, h/s, w/s]`, each of whose pixels is
+/// repeated s × s times: `[B, C₁ + C₂, h, w]`.
 ///
 /// # Errors
 /// Shapes that do not fit; a dtype other than f32.
-pub fn join(fine: &Tensor, coarse: &Tensor, s: usize) -> Result<Tensor> {
-    let ((b, c1, h, w), (cb, c2, ch, cw)) = (fine.dims4()?, coarse.dims4()?);
+pub fn cat_upsampled(fine: &Tensor, coarse: &Tensor, s: usize) -> Result<Tensor> {
+    let (b, c1, h, w) = fine.dims4()?;
+    let (cb, c2, ch, cw) = coarse.dims4()?;
     if cb != b || s == 0 || [s * ch, s * cw] != [h, w] || [h, w, c1, c2].contains(&0) {
         bail!(
             "{NAME}: expected [B, C, {s}·h, {s}·w] and [B, C', h, w], got {:?} and {:?}",
@@ -42,9 +42,10 @@ impl CustomOp2 for Op {
         s2: &CpuStorage,
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (fine, coarse) =
-            (slice::<f32>(NAME, "fine", s1, l1)?, slice::<f32>(NAME, "coarse", s2, l2)?);
-        let ([c1, c2], [h, w]) = (self.0.channels, self.0.size);
+        let fine = slice::<f32>(NAME, "fine", s1, l1)?;
+        let coarse = slice::<f32>(NAME, "coarse", s2, l2)?;
+        let [c1, c2] = self.0.channels;
+        let [h, w] = self.0.size;
         let shape = (l1.dims()[0], c1 + c2, h, w);
         output(cpu::forward(&self.0, shape.0, fine, coarse), shape)
     }
