@@ -57,7 +57,8 @@
 //! * [`load_scene`], [`load_splats`] and [`save_splats`] read and write files.
 //! * `estimate_cameras` and `estimate_cameras_of_files` estimate the cameras of photographs that
 //!   have none, in memory and in files; the module `estimate` holds their options and results.
-//! * [`details`] holds reports, and types that are seldom named.
+//! * The modules hold reports, options and types that are seldom named: [`scene`], [`files`], [`cameras`],
+//!   [`finish`], `reconstruct`. The modules `network` and [`kernels`] carry no promise between versions.
 //! * [`Camera`] and [`Intrinsics`] define all geometric conventions: OpenCV axes, pixel centres
 //!   at +0.5, `world_from_camera`.
 //!
@@ -66,7 +67,7 @@
 //! * `network` (default): the network, its training and its scores, on candle. Without it the
 //!   crate has cameras, splats, their files and the rasterizer.
 //! * `gpu` (default): the kernels as WGSL compute, through wgpu. In a browser (WebGPU) a program
-//!   supplies the wait for the device: `details::set_gpu_wait`.
+//!   supplies the wait for the device: `kernels::gpu::set_gpu_wait`.
 //! * `heic`: reads HEIC pictures, the default format of iPhones, in pure Rust.
 
 #![forbid(unsafe_code)]
@@ -82,6 +83,7 @@ pub mod scene;
 
 pub use glam;
 pub use image;
+pub use subsplat_kernels as kernels;
 
 #[cfg(feature = "network")]
 pub use crate::network::config::{Config, ConfigError, Preset};
@@ -91,8 +93,7 @@ pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 pub use crate::reconstruct::{
     Check, Density, DepthBounds, DepthRange, Detail, Error, InputSize, Options, Photo, Poses,
     Prepared, Progress, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
-    estimate_cameras,
-    estimate_cameras_of_files,
+    estimate_cameras, estimate_cameras_of_files,
 };
 pub use files::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};
 pub use files::photograph::{Photograph, load_photograph, parse_photograph};
@@ -109,44 +110,3 @@ pub use subsplat_kernels::backend::{Backend, DeviceError};
 pub use subsplat_kernels::camera::{Camera, CameraError, Intrinsics, NearFar, Size};
 pub use subsplat_kernels::device::DeviceChoice;
 pub use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
-
-/// Types that an application reads or sets rarely: reports of a reconstruction, its inputs and its
-/// refinement, details of scenes and photographs, and the errors beneath [`FileError`] and `Error`.
-pub mod details {
-    pub use crate::cameras::check::{
-        DepthReport, EpipolarReport, Finding, MatchedPoint, PairReport, ReadingReport, Verdict,
-    };
-    pub use crate::files::SaveReport;
-    pub use crate::files::exif::{ExifCamera, FocalLength, FocalSource};
-    pub use crate::files::image::Truncated;
-    pub use crate::files::scene::{LoadedFrame, Pixels, SceneFormat, Units};
-    pub use crate::files::undistort::Distortion;
-    pub use crate::finish::{
-        FinishError, FitReport, RefineOptions, RefineReport, Refiner, TargetView,
-    };
-    #[cfg(feature = "network")]
-    pub use crate::reconstruct::inputs::crop::{
-        CropOptions, CropRule, Cropped, LrFrom, PhotoWindow,
-    };
-    #[cfg(feature = "network")]
-    pub use crate::reconstruct::{DepthSource, StageTime};
-    pub use crate::scene::metrics::MetricsError;
-    pub use crate::scene::splats::SplatParts;
-    #[cfg(all(feature = "gpu", target_family = "wasm", target_os = "unknown"))]
-    pub use subsplat_kernels::gpu::set_gpu_wait;
-    #[cfg(feature = "gpu")]
-    pub use subsplat_kernels::gpu::{Gpu, GpuError};
-}
-
-/// Options and results of [`estimate_cameras`] and [`estimate_cameras_of_files`],
-/// which estimate the cameras of photographs.
-#[cfg(feature = "network")]
-pub mod estimate {
-    pub use crate::cameras::estimation::{
-        Confidence, FocalEstimate, LeftOut, PoseAdjustment, PoseEstimate, PoseOptions,
-        PosePhotoError, PosePoint, PoseRefusal, PoseWarning, Uncertain,
-    };
-    pub use crate::reconstruct::{
-        EstimateOptions, EstimatedPhotos, EstimatedScene, KnownLens, LensSource, PoseError,
-    };
-}

@@ -1,7 +1,7 @@
 //! Time for reports. WebAssembly without an operating system has no clock: durations are 0 there.
 
 /// Whether there is a clock, without which durations limit nothing.
-pub(crate) const HAS_CLOCK: bool = !cfg!(all(target_family = "wasm", target_os = "unknown"));
+pub const HAS_CLOCK: bool = !cfg!(all(target_family = "wasm", target_os = "unknown"));
 
 #[cfg(not(all(target_family = "wasm", target_os = "unknown")))]
 pub use std::time::Instant;

@@ -227,7 +227,7 @@ impl Scene {
 
 /// Returns a frame of a photograph and the camera of its upright pixels.
 fn upright_draft((path, camera): &(PathBuf, Camera)) -> Draft {
-    let k = camera.intrinsics;
+    let k = camera.intrinsics();
     Draft {
         size: Some((k.width, k.height)),
         pixels: Pixels::Upright,
@@ -236,7 +236,7 @@ fn upright_draft((path, camera): &(PathBuf, Camera)) -> Draft {
             String::new(),
             path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             Lens::Pixels([k.fx, k.fy, k.cx, k.cy].map(f64::from)),
-            camera.world_from_camera.as_dmat4(),
+            camera.world_from_camera().as_dmat4(),
         )
     }
 }

@@ -33,7 +33,7 @@ pub(super) struct Target<'a> {
 impl<'a> Target<'a> {
     /// Refuses a picture of another size than its camera. `index` names the view.
     pub fn check(index: usize, view: &TargetView<'_>) -> Result<(), FinishError> {
-        let k = view.camera.intrinsics;
+        let k = view.camera.intrinsics();
         if (k.width, k.height) != (view.image.width, view.image.height) {
             let expected = format!("{}x{}", k.width, k.height);
             let got = format!("{}x{}", view.image.width, view.image.height);
@@ -58,7 +58,7 @@ impl<'a> Target<'a> {
 
     /// [`Target::loss`] with another `truth`.
     fn loss_to(&self, planes: &[f32], truth: &[f32]) -> Scored {
-        let k = self.camera.intrinsics;
+        let k = self.camera.intrinsics();
         let rgb = &planes[..truth.len()];
         let mut loss = mse(rgb, truth);
         if self.dssim > 0.0 {
@@ -116,7 +116,7 @@ pub(super) fn by_planes(loss: Scored, planes: &[f32]) -> Vec<f32> {
 /// Size of a pixel at each Gaussian, in the photograph where it is smallest, world units.
 pub(super) fn pixel_sizes(splats: &Splats, views: &[TargetView<'_>]) -> Vec<f32> {
     let size = |mean: Vec3, camera: &Camera| {
-        mean.distance(camera.position()) / camera.intrinsics.fx.max(camera.intrinsics.fy)
+        mean.distance(camera.position()) / camera.intrinsics().fx.max(camera.intrinsics().fy)
     };
     let rows = splats.rows.par_chunks_exact(SPLAT_STRIDE);
     rows.map(|row| {
@@ -133,7 +133,7 @@ pub(super) fn beyond(splats: &Splats, views: &[TargetView<'_>]) -> Vec<bool> {
     let shown = |row: &[f32], camera: &Camera| {
         let mean = Vec3::from_slice(&row[MEAN_OFFSET..]);
         let Some(p) = camera.project(mean) else { return false };
-        let k = camera.intrinsics;
+        let k = camera.intrinsics();
         let sigma = row[SCALE_OFFSET..SCALE_OFFSET + 3].iter().fold(0.0f32, |m, s| m.max(*s));
         let reach = 3.0 * sigma * k.fx.max(k.fy) / camera.to_camera(mean).z;
         let size = Vec2::new(k.width as f32, k.height as f32);

@@ -30,12 +30,12 @@ impl CameraMeasures {
     /// Measures two cameras.
     pub(super) fn new(cameras: &[Camera; 2]) -> Self {
         let views = TwoViews::new(&cameras[0], &cameras[1]);
-        let [a, b] = cameras.map(|c| c.world_from_camera);
+        let [a, b] = cameras.map(|c| c.world_from_camera());
         Self {
             baseline: views.translation.length() as f32,
             rotation_deg: views.rotation_angle().to_degrees() as f32,
             fov_deg: cameras
-                .map(|c| [c.intrinsics.fov_x().to_degrees(), c.intrinsics.fov_y().to_degrees()]),
+                .map(|c| [c.intrinsics().fov_x().to_degrees(), c.intrinsics().fov_y().to_degrees()]),
             is_same_camera: a.abs_diff_eq(b, 1e-6),
         }
     }
@@ -80,7 +80,8 @@ impl Measures {
     pub(super) fn new(work: &WorkingPair, matched: &Matched, cameras: &CameraMeasures) -> Self {
         let views = TwoViews::new(&work.cameras[0], &work.cameras[1]);
         let chosen = matched.consistent_matches();
-        let [k_a, k_b] = work.cameras.each_ref().map(|c| &c.intrinsics);
+        let intrinsics = work.cameras.each_ref().map(|c| c.intrinsics());
+        let [k_a, k_b] = intrinsics.each_ref();
         let coverage = [
             geometry::coverage(k_a, chosen.iter().map(|m| m.a)),
             geometry::coverage(k_b, chosen.iter().map(|m| m.b)),
@@ -127,7 +128,8 @@ fn measure_depths(
     views: &TwoViews,
     chosen: &[Match],
 ) -> (DepthMeasures, Option<[f32; 2]>) {
-    let [k_a, k_b] = work.cameras.each_ref().map(|c| &c.intrinsics);
+    let intrinsics = work.cameras.each_ref().map(|c| c.intrinsics());
+        let [k_a, k_b] = intrinsics.each_ref();
     let longer_side = work.images[1].width().max(work.images[1].height());
     let parallax_px = geometry::parallax(views, chosen, longer_side);
     // A third of the limit is the accuracy of a match, measured on good poses.

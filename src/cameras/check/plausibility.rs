@@ -29,8 +29,8 @@ pub(super) fn of_cameras(
 ) -> Vec<Finding> {
     let mut findings = Vec::new();
     for (name, (image, camera)) in ["first", "second"].into_iter().zip(views) {
-        findings.extend(size(name, image, &camera.intrinsics));
-        findings.extend(intrinsics(name, &camera.intrinsics));
+        findings.extend(size(name, image, &camera.intrinsics()));
+        findings.extend(intrinsics(name, &camera.intrinsics()));
     }
     if cameras.is_same_camera {
         let sentence = "both photographs have the same camera position: depth can be seen only \
