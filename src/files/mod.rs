@@ -5,6 +5,9 @@
 //! reader sees a partial file. Readers compare every declared size with the bytes that
 //! exist before they allocate. They check the checksums of a container and refuse bytes
 //! after its end.
+//!
+//! Foreign conventions end here and in the network's `primaries.rs`. Every binary reader has a `parse_*` of
+//! bytes, which tests and fuzz targets call.
 
 pub mod compressed_ply;
 mod gaussians;

@@ -3,6 +3,8 @@
 //! A [`Photograph`] is upright: its EXIF orientation is applied. `image.rs` keeps the stored
 //! pixels instead, to which pose files refer. The EXIF block also gives the focal length
 //! (`exif.rs`).
+//!
+//! ICC profiles are applied to both kinds of pictures: a wrong colour is wrong for every reader.
 
 use super::assemble::list_images;
 use super::decode::{self, Header, decode};

@@ -6,6 +6,15 @@
 //! weighted by the parent's share of the photographs, and costs its further children. Grids are taken
 //! by gain over cost until the number of Gaussians is reached. A number below that of the parents
 //! keeps those with the largest shares, one Gaussian each.
+//!
+//! A grid's gain is the photograph's variance that its children can show. Children are chosen before the fit, which
+//! makes up for those that are missing. `Splats` then hold an SH set for each Gaussian: an index of parents would be
+//! read by every kernel.
+//!
+//! Of three photographs or more, parents with less than 0.3 of an average parent's share of all photographs are
+//! removed, and the photographs share the Gaussians of two and a half. Other fusions were tried and left
+//! out: lowering the opacity of contradicted points costs 0.3 dB with sources weighed by visibility, and
+//! agreement merges only a tenth of the Gaussians. The shares are gradients by colour offsets.
 
 use crate::files::resize::{Filter, resize};
 use crate::reconstruct::inputs::crop::Cropped;

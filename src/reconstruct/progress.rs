@@ -1,4 +1,7 @@
 //! Progress of a reconstruction: stages, fractions, times, cancellation.
+//!
+//! The callback runs on the caller's thread, so that it need not be `Send`. The network runs on a thread of the
+//! pool and calls a checkpoint after each stage and each chunk.
 
 use super::{Error, Result};
 use crate::network::model::trace::Checkpoint;

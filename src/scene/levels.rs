@@ -6,6 +6,9 @@
 //! along one axis. A level has at most half of the Gaussians of the level before. A Gaussian with a σ
 //! above the cells' side stays as it is.
 //!
+//! Groups of four along the Morton curve were considered, but a group that spans a jump of the curve merges distant
+//! Gaussians. A cell bounds the size of every merge, and one rule chooses all levels.
+//!
 //! The rasterizer widens each Gaussian by a low-pass. A merge conserves the optical depth after the
 //! low-pass, for the size of a pixel at which its level is chosen.
 //!
@@ -23,7 +26,7 @@
 //! | the same in the pixels that the scene covers | ∞ | ∞ | 49.9 | 44.3 | 38.0 | 35.8 |
 //! | the same with cells of 1.5 pixels | ∞ | 48.2 | 42.0 | 37.5 | 33.5 | 31.2 |
 //!
-//! `cargo bench --bench raster -- levels` times frames; README.md, "Viewer", has numbers.
+//! `cargo bench --bench raster -- levels` times frames; benches/README.md, "Level of detail", has numbers.
 //!
 //! The picture of all Gaussians is itself no reference far away: the nearest of many Gaussians in a pixel
 //! decide its colour, while a merge has the mean of all.

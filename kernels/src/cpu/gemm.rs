@@ -15,6 +15,8 @@
 //!
 //! 1×1 convolutions of any stride, their weight gradients and the feed-forward block are such
 //! products.
+//!
+//! This replaces candle's matrix product, whose own thread pool spins, and locks when rayon's threads call it.
 
 mod packing;
 mod register_tile;

@@ -1,4 +1,6 @@
 //! Output buffers that threads write for the first time: no pass of zeros by one thread.
+//!
+//! Programs, not the library, declare an allocator with huge pages (`tools/cli/src/pages.rs`).
 
 use rayon::prelude::*;
 use std::mem::MaybeUninit;

@@ -4,6 +4,19 @@
 //! Only the sizes of bindings, buffers and textures are those of the adapter ([`limits_of`]). Timestamps
 //! and subgroup operations are used where the adapter has them ([`features_of`]).
 //! [`Gpu::from_device`] takes an application's own device.
+//!
+//! Softmax, layer norm and group norm, and their gradients, reduce over a workgroup with subgroup operations
+//! where the adapter has them. The two forms are one shared WGSL file each (`place.wgsl`, `place_subgroups.wgsl`) and add in the
+//! same order, so every subgroup size gives the same bytes. A reduction has 8 barriers with 64 threads and
+//! 10 with 256; with subgroups of 32 it has 2. On lavapipe (subgroups of 8, `cargo bench --bench device --
+//! --subgroups`) layer norm takes 27.4 ms instead of 31.9, its gradient 58 instead of 68, softmax of 32 numbers
+//! 184 instead of 204, and group norm 23.5 instead of 22.8. `SUBSPLAT_SUBGROUPS=off` takes the form without.
+//! Browsers take it always, because naga 30 does not read `enable subgroups;`.
+//!
+//! Other kernels use no subgroup operations. In the rasterizer's backward pass a splat's ten sums would need 50
+//! shuffles a thread, where a thread stores ten numbers and reads about ten. In sort and prefix sum a
+//! subgroup may lack threads, so the tables in workgroup memory would remain. Attention would save 2
+//! of its 19 barriers a step at width 128.
 
 use crate::device::DeviceChoice;
 use crate::gpu::adapter::{AdapterSummary, find};

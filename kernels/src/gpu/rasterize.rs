@@ -7,6 +7,10 @@
 //! pairs grows when the read-back of a frame reports that it was too small. Frames that exceed a
 //! binding are drawn in layers (kernels/src/gpu/layers.rs).
 //!
+//! A thread processes four pixels. llvmpipe reads memory lane by lane; without AVX-512 it puts each number into its
+//! vector through the stack, where the reload waits for the store. There one pixel a thread takes 3.2 times the CPU time:
+//! 3.9 s a frame instead of 1.2 s for 131,072 splats at 512² (Xeon; with AVX-512 0.86 s and 0.37 s).
+//!
 //! Commands are lists of calls, encoded and submitted at once inside error scopes.
 
 use crate::camera::Camera;

@@ -1,5 +1,7 @@
 //! A stable radix sort of 32-bit keys, 4 bits per pass.
 //!
+//! Splats are sorted by depth, then their (splat, tile) pairs by tile. Both sorts are stable, so the order is the CPU's.
+//!
 //! Counting, prefix sum and scatter are separate dispatches, so that no workgroup waits for
 //! another. CPU version: kernels/src/cpu/raster/sort.rs. WGSL: kernels/sort_count.wgsl, kernels/scan_whole.wgsl,
 //! kernels/sort_scatter.wgsl. Tests: tests/gpu/raster.rs.

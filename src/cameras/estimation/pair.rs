@@ -3,6 +3,15 @@
 //! Matches without any geometry give candidates ([`ransac`]). Each distinct candidate finds its
 //! matches anew along its epipolar lines and is refined on them, aligned below the pixel. The pose
 //! with the largest support on its own matches is chosen.
+//!
+//! Up to three candidates are compared by their matches whose surroundings agree below the pixel (photographs, not
+//! positions). On 96 pairs that the report does not use, the area under the curve of errors up to 10° is 0.81 with known
+//! intrinsics and 0.69 with unknown ones. Detected positions alone gave 0.77 and 0.68, and refused more pairs.
+//!
+//! Alignment below the pixel (affine Lucas-Kanade) halves the residuals. Thresholds were chosen on 53 pairs of
+//! `../shared/photos` that the report (16 context pairs) does not use. Matches found along the lines of a pose are
+//! no evidence for it: the matches found before decide whether a pose is refused. `benches/README.md` has the
+//! report.
 
 use super::photo::{PosePhoto, aligned, detected, deviations};
 use super::ransac;

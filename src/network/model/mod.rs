@@ -1,6 +1,12 @@
 //! The network as candle modules: from images and cameras to children.
 //!
 //! Parameter names are PyTorch's, so that a converted checkpoint loads without renaming.
+//!
+//! The modules are written once, over the trait `ops::Array`: candle's tensors implement it with the CPU kernels
+//! and their gradients, arrays of a GPU with WGSL kernels over device memory. A recorded graph was considered: it
+//! would need the same set of operations, and a second form of each loop over views and chunks. The trait costs a
+//! type parameter on each `forward`, and operators become methods. Modules that neither preset uses
+//! (`aggregation/ablated.rs`) take tensors.
 
 pub mod aggregation;
 pub mod architecture;

@@ -4,6 +4,10 @@
 //! In: quaternions xyzw in camera frame; SH colour-major in camera frame. Out: quaternions
 //! wxyz in world frame, unit, w ≥ 0; SH in world frame, masked by degree. Tests:
 //! tests/network/primaries.rs, tests/network/parity.rs.
+//!
+//! MVSplat rotates SH coefficients in e3nn's basis and evaluates them in another, so a rotated camera changes
+//! its colours. `ShFrame::Mvsplat` reproduces this. `ShFrame::MvsplatExact` (`tuned`) converts to the
+//! standard basis and rotates exactly.
 
 use super::trace::Trace;
 use super::{BackboneOutput, Primaries, Views};

@@ -3,6 +3,14 @@
 //! On a GPU the backbone's outputs, the primaries and the children stay in device memory until the
 //! host needs them: [`SceneEncoding::render`] reads one picture, [`SceneEncoding::children`] the
 //! Gaussians. A failure of the device repeats the scene on the CPU.
+//!
+//! A chunk of children is a part of the rasterizer's scene, without a copy. `SceneEncoding::render` reads back
+//! the picture and the 48 bytes that hold the frame's number of pairs; `Gpu::read_backs` counts, and a
+//! test compares. `subsplat run` writes the Gaussians. It reads them, with depths and SH, in one wait; with a limit on
+//! their number it reads the primaries before. Gaussians that are not finite are errors there. `render`
+//! on a GPU does not draw them, because a check would be one more read-back.
+//!
+//! Repeating single calls after a failure, or the trunk alone, would need copies of arrays in host memory.
 
 use super::primaries::primaries;
 use super::subsplat::{SceneOutput, SubSplat, in_pool};

@@ -14,6 +14,9 @@
 //! * `coord`: hid_k = GELU(lin0·norm(x) + c_k), o_k = lin1·hid_k, with
 //!   c_k = `pos1`·GELU(`pos0`·posenc(g_k)) of the sub-pixel's position g_k. The
 //!   parameters do not depend on K.
+//!
+//! One set of `polynomial` heads serves every K. The layer of a child is made once per run, so any K
+//! costs what fixed heads cost. `coord` applies its activation K times as often.
 
 use super::embed::Descriptors;
 use super::layers::{Activation, LayerNorm};

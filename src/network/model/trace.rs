@@ -1,4 +1,4 @@
-//! Recording of intermediate tensors, for `subsplat compare` and tests, and checkpoints at which
+//! Recording of intermediate tensors, for `subsplat-lab compare` and tests, and checkpoints at which
 //! a caller can cancel. A trace without either costs nothing.
 
 use crate::network::ops::Array;

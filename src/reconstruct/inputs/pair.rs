@@ -5,6 +5,14 @@
 //! 60 %; the weights that ship do best at 85 % (measured, see `OVERLAP`).
 //!
 //! Lengths are world units, angles degrees.
+//!
+//! The pair of a scene is chosen for the mean PSNR over all frames of the scene, those outside the pair included.
+//! PSNR between two neighbours alone is highest, but such a pair covers little. An overlap of 85 % serves both:
+//! on four scenes of real photographs that did not choose the rule, PSNR over all frames is 18.6 dB (40 to 60 %:
+//! 17.7), and over frames between the two photographs 23.2 dB (18.0).
+//!
+//! Of many photographs, each is compared with its two best partners (`choose_sources`), not with all: the time
+//! grows with twice the number of photographs, and wide pairs harm.
 
 use crate::files::scene::{Scene, Units};
 use glam::{Mat3, Vec2, Vec3};

@@ -1,10 +1,10 @@
-//! Makes a test set of procedural rooms for `subsplat eval`, one scene folder each:
+//! Makes a test set of procedural rooms for `subsplat-lab eval`, one scene folder each:
 //!
 //! ```text
 //! cargo run --release --example make_rooms -- out/rooms 24 77   # folder, rooms, seed (and
 //!     # the share of rooms with things close before the cameras: 0; the share of scenes of
 //!     # shapes at random places, with cameras of a wide range: 0)
-//! subsplat eval out/rooms --upscale 2
+//! subsplat-lab eval out/rooms --upscale 2
 //! ```
 //!
 //! Two context pictures and two targets of 256², drawn as training draws its examples

@@ -3,6 +3,14 @@
 //! A register tile holds the sums of 6 rows × up to four vectors of columns. The loop over k
 //! loads one row of the panel as vectors and six elements of the left factor as scalars, and
 //! adds their products. The epilogue computes `base + scale · sums` and stores it once.
+//!
+//! Register tiles follow the registers of a level (`Simd::REGISTERS`, in vectors of 16 lanes): 24 sums with
+//! AVX-512; 12, then 8, with AVX2 and NEON. Each sum has its products in the same order, so the tile's size
+//! changes no bit.
+//!
+//! The row pointers come from a place that the compiler cannot see. It would compute the addresses anew
+//! in the loop: 29 instead of 24 instructions for 12 multiply-adds with AVX2, which is slower on processors with four
+//! instructions a cycle. Matrix products take 16 % fewer instructions this way.
 #![expect(
     clippy::needless_range_loop,
     reason = "counted loops over register tiles unroll, iterators over them need not"

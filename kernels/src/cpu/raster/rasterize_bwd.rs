@@ -13,6 +13,8 @@
 //!
 //! The moments of a splat are in whitened coordinates, so that the sums of needle-shaped splats do
 //! not cancel.
+//!
+//! Each tile runs forward again, so nothing is stored per pixel and splat.
 
 use crate::camera::Camera;
 use crate::cpu::raster::blend::Rules;

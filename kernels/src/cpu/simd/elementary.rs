@@ -3,6 +3,9 @@
 //! Each function is good to a few ulp (bounds below, held by tests on every level). None
 //! branches on a lane, so that loops over single numbers vectorize. Coefficients: Cephes
 //! (`expf`, `logf`, `sinf`, `cosf`), Eigen (`erf`), Remez' algorithm (`exp2`, `log2`).
+//!
+//! `exp` returns 0 for arguments below −87.3, so softmax produces no denormals. The processor's
+//! flush-to-zero bits stay unset, because Rust code may not run under another floating-point environment.
 
 use super::{F32Vector, IntVector, LANES, Mask};
 use std::f32::consts::{FRAC_1_SQRT_2, FRAC_2_PI, LOG2_E};

@@ -12,6 +12,9 @@
 //! In: pictures, cameras, distances along the unit rays, confidences, tolerances. Out: distances,
 //! `[V, H·W]`. No gradient: the choice has no derivative. Oracle: the same in f64 by matrices (the
 //! tests).
+//!
+//! Views support and never oppose: opposition by surfaces that would be hidden costs 0.3 dB. The consensus
+//! runs at inference alone, after the heads.
 
 use super::rgbd::{RgbdView, Surface};
 use rayon::prelude::*;

@@ -11,6 +11,8 @@
 //! An untrained model is a classical plane sweep: the stem starts as an aggregation of the
 //! raw scores, every learned correction at zero, the colour at the pixel's colour.
 //! Parameters have the prefix `small.`.
+//!
+//! A source view counts, pixel by pixel, by its probability mass around the mode (`visible_mean`).
 
 use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mean};
 use crate::network::config::{FeatureLevel, Small};

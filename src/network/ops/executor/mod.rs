@@ -4,6 +4,10 @@
 //! reaches holds a node of a tape (`tape.rs`), from which [`Executor::backward`] computes
 //! gradients; other arrays hold none. The gradients are those of the CPU ops
 //! (tests/gpu/array_gradients.rs).
+//!
+//! Parameters stay on the device by their candle id. A parameter that training can change is uploaded at
+//! each use, unless the optimizer keeps it there (`adam.rs`). A parameter that eight passes did not use is
+//! freed, because heads for another number of children are new tensors.
 
 mod adam;
 mod array;

@@ -1,5 +1,10 @@
 //! Rules of gradients that several operations share, arguments of kernels, and the gradient of the
 //! children.
+//!
+//! A rule reuses forward kernels where the gradient is the same operation: a convolution's input gradient
+//! is a convolution with the mirrored weight, a linear layer's one with the transposed weight.
+//! Gradients of parameters are sums of parts whose number depends on sizes alone. A rule that leaves out
+//! the gradient of a tracked input ends the pass with an error that names it.
 
 use super::{DeviceGradients, OnDevice, TapeArray};
 use crate::network::ops::Array;

@@ -4,6 +4,11 @@
 //! nodes in the reverse order of their numbers, and adds gradients of one node in that order, so
 //! that the bytes depend on the operations alone. A rule owns the arrays it needs and is dropped
 //! once it has run, so that their memory returns to the pool during the pass.
+//!
+//! A leaf of the tape is a copy of a tensor of candle, and its gradient returns as a scalar of candle's
+//! graph (`precomputed_gradient`). Losses, adapter and rasterizer of a training therefore stay candle's, and layers
+//! that are sums of parameters (`polynomial` heads) need no rule here. The alternative, all of a step on one
+//! tape, would need the losses as kernels too.
 
 use super::{Executor, OnDevice, TapeArray};
 use crate::network::ops::precomputed_gradient::precomputed_gradient;

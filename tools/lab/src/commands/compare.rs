@@ -1,4 +1,4 @@
-//! `subsplat compare`: the encoder, or the rasterizer, against a reference file.
+//! `subsplat-lab compare`: the encoder, or the rasterizer, against a reference file.
 
 use super::args::{CompareArgs, SimdArg};
 use super::compare_raster::{self, Comparison};

@@ -1,4 +1,4 @@
-//! `subsplat compare` of a rasterizer case: our picture and its gradients against those of
+//! `subsplat-lab compare` of a rasterizer case: our picture and its gradients against those of
 //! the reference, as far as the file holds them.
 //!
 //! Boundary pixels are left out, where the file marks them: there rounding may flip a

@@ -1,4 +1,4 @@
-//! `subsplat eval`: scores methods on photographs.
+//! `subsplat-lab eval`: scores methods on photographs.
 
 use super::args_eval::{CropArg, EvalArgs, LrFromArg};
 use crate::eval::{

@@ -1,4 +1,4 @@
-//! Reads a rasterizer case for `subsplat compare`: one `.safetensors` file with splats, a
+//! Reads a rasterizer case for `subsplat-lab compare`: one `.safetensors` file with splats, a
 //! camera, and the pictures and gradients of a reference rasterizer.
 //!
 //! Pictures and gradients are optional, each by itself. Options are metadata strings

@@ -1,4 +1,4 @@
-//! `subsplat train`: trains a model by its configuration, with progress for the user.
+//! `subsplat-lab train`: trains a model by its configuration, with progress for the user.
 
 use super::args::TrainArgs;
 use super::tensorboard::Board;

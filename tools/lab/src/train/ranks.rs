@@ -129,7 +129,7 @@ pub(super) struct Exchange {
     step: u64,
     /// Hash of the step, the configuration and the weights.
     state: u64,
-    /// True if a rank wishes to end after this step.
+    /// True if a rank requests the end of the training after this step.
     ends: bool,
     /// Files of this rank for this step and the one before.
     written: [Vec<PathBuf>; 2],
@@ -190,7 +190,7 @@ impl Exchange {
         self.folder.join(format!("{:08}-{group:04}-rank-{owner}.safetensors", self.step))
     }
 
-    /// Writes the gradients of a group of this rank. `end` wishes the end after this step.
+    /// Writes the gradients of a group of this rank. `end` requests the end of the training after this step.
     ///
     /// # Errors
     /// A file that cannot be written.

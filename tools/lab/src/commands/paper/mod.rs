@@ -1,4 +1,4 @@
-//! `subsplat paper`: the paper's tables and figures by one command, the paper's numbers beside.
+//! `subsplat-lab paper`: the paper's tables and figures by one command, the paper's numbers beside.
 //!
 //! `tables.rs` lists them as data. Rows are scored by [`crate::eval`]; rows whose weights exist
 //! nowhere are trained by [`crate::train`].
