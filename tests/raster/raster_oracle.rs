@@ -367,9 +367,8 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
     }
 }
 
-/// Levels with fused products agree to the byte, however wide their registers; the
-/// scalar one, which rounds products as well, to 1e-5 but for pixels where that flips
-/// a decision.
+/// Levels with fused products agree to the byte, however wide their registers. The baseline,
+/// which rounds products as well, agrees to 1e-5 but for pixels where that flips a decision.
 #[test]
 fn levels_agree() {
     let (mut flipped, mut pixels) = (0, 0);
@@ -384,29 +383,29 @@ fn levels_agree() {
                     &o,
                 )
             };
-            let scalar = render(SimdLevel::Scalar);
-            let fused = SimdLevel::available().iter().filter(|&&t| t != SimdLevel::Scalar);
+            let baseline = render(SimdLevel::Baseline);
+            let fused = SimdLevel::available().iter().filter(|&&t| t != SimdLevel::Baseline);
             let fused: Vec<Rendered> = fused.map(|&t| render(t)).collect();
             for other in fused.windows(2) {
                 assert!(bytes(&other[0]) == bytes(&other[1]), "{kind:?} {convention:?}");
             }
             if let Some(picture) = fused.first() {
                 pixels += picture.alpha.len();
-                for (a, b) in picture.rgb.chunks_exact(3).zip(scalar.rgb.chunks_exact(3)) {
+                for (a, b) in picture.rgb.chunks_exact(3).zip(baseline.rgb.chunks_exact(3)) {
                     let apart = a.iter().zip(b).map(|(a, b)| (a - b).abs() / b.abs().max(1.0));
                     flipped += usize::from(apart.fold(0.0, f32::max) > 1e-5);
                 }
             }
         }
     }
-    eprintln!("{flipped} of {pixels} pixels differ between scalar and fused levels");
+    eprintln!("{flipped} of {pixels} pixels differ between baseline and fused levels");
     assert!(flipped * 100 <= pixels, "{flipped} of {pixels} pixels");
 }
 
 /// A context without a requested level uses the best one. A context with a level that the
 /// processor lacks still draws.
 #[test]
-fn foreign_tiers_draw_as_the_scalar_one() {
+fn absent_levels_draw_as_the_baseline() {
     let scene = scene(Kind::Plain, 11, (64, 48), 0);
     let o = options(Convention::Standard);
     let render = |r: Rasterizer| bytes(&{ r }.render(&slices(&scene.splats), &scene.camera, &o));
@@ -415,8 +414,8 @@ fn foreign_tiers_draw_as_the_scalar_one() {
     );
     for level in [SimdLevel::Avx2, SimdLevel::Avx512, SimdLevel::Neon] {
         if !level.is_available() {
-            let scalar = Rasterizer::new().with_simd_level(SimdLevel::Scalar);
-            assert!(render(Rasterizer::new().with_simd_level(level)) == render(scalar));
+            let baseline = Rasterizer::new().with_simd_level(SimdLevel::Baseline);
+            assert!(render(Rasterizer::new().with_simd_level(level)) == render(baseline));
         }
     }
 }

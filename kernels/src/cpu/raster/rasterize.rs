@@ -5,7 +5,7 @@
 //! RGB over the background, accumulated alpha 1 − T, and Σ w·z with z the camera z
 //! of the means in world units (in either convention). Tiles run in rayon's current pool;
 //! the bytes do not depend on its size. All SIMD levels give the same bytes except
-//! [`SimdLevel::Scalar`], which rounds products.
+//! [`SimdLevel::Baseline`], which rounds products.
 //!
 //! A splat is one 64-byte record, not an entry in a structure of arrays, because tiles gather
 //! splats by index.
@@ -106,9 +106,9 @@ impl Rasterizer {
         self
     }
 
-    /// Uses the instructions of `level` (default [`SimdLevel::best`]), or the scalar ones if
+    /// Uses the instructions of `level` (default [`SimdLevel::best`]), or the baseline's if
     /// the processor lacks them. Levels that fuse multiply and add give the same bytes. The
-    /// scalar one differs by about 1e-6 of a colour, and by a contribution of 1/255 where
+    /// baseline differs by about 1e-6 of a colour, and by a contribution of 1/255 where
     /// rounding decides whether a splat is skipped.
     pub fn with_simd_level(mut self, level: SimdLevel) -> Self {
         self.level = level;

@@ -1,5 +1,7 @@
-//! Lanes as an array of 16 floats: the scalar level of targets without a module of their own,
-//! and, with fused products too, what tests compare every level with.
+//! Sixteen lanes as arrays: the baseline of targets without a module of their own, and, with
+//! fused products too, what tests compare every level with.
+//!
+//! The tests need a definition of their own, so that this module shares no code with `quad`.
 #![expect(clippy::needless_range_loop, reason = "counted loops over arrays become vectors")]
 
 use super::{
@@ -156,10 +158,8 @@ impl<const FUSED: bool> Vector for F<FUSED> {
     fn fma(self, b: Self, c: Self) -> Self {
         let mut out = c.0;
         for i in 0..LANES {
-            out[i] = match FUSED {
-                true => self.0[i].mul_add(b.0[i], c.0[i]),
-                false => self.0[i] * b.0[i] + c.0[i],
-            };
+            out[i] =
+                if FUSED { self.0[i].mul_add(b.0[i], c.0[i]) } else { self.0[i] * b.0[i] + c.0[i] };
         }
         F(out)
     }

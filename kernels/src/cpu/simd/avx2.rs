@@ -375,7 +375,8 @@ impl Simd for Token {
     #[inline(always)]
     unsafe fn store_masked(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
         unsafe {
-            let (lanes, to) = (self.mask_from_bits(u32::from(bits)), to.cast::<f32>());
+            let lanes = self.mask_from_bits(u32::from(bits));
+            let to = to.cast::<f32>();
             _mm256_maskstore_ps(to, _mm256_castps_si256(lanes.0), v.0);
             _mm256_maskstore_ps(to.wrapping_add(8), _mm256_castps_si256(lanes.1), v.1);
         }
@@ -410,14 +411,16 @@ impl Simd for Token {
     #[inline(always)]
     fn deinterleave_quarters(self, a: F, b: F) -> [F; 2] {
         unsafe {
-            let ([a, c], [b, d]) = (halves(a.0, a.1), halves(b.0, b.1));
+            let [a, c] = halves(a.0, a.1);
+            let [b, d] = halves(b.0, b.1);
             [F(a, b), F(c, d)]
         }
     }
     #[inline(always)]
     fn interleave_quarters(self, even: F, odd: F) -> [F; 2] {
         unsafe {
-            let ([a, b], [c, d]) = (halves(even.0, odd.0), halves(even.1, odd.1));
+            let [a, b] = halves(even.0, odd.0);
+            let [c, d] = halves(even.1, odd.1);
             [F(a, b), F(c, d)]
         }
     }
@@ -432,7 +435,8 @@ impl Simd for Token {
     #[inline(always)]
     fn deinterleave(self, a: F, b: F) -> [F; 2] {
         unsafe {
-            let ([a, c], [b, d]) = (halves(a.0, a.1), halves(b.0, b.1));
+            let [a, c] = halves(a.0, a.1);
+            let [b, d] = halves(b.0, b.1);
             let even = F(_mm256_shuffle_ps::<0x88>(a, c), _mm256_shuffle_ps::<0x88>(b, d));
             [even, F(_mm256_shuffle_ps::<0xdd>(a, c), _mm256_shuffle_ps::<0xdd>(b, d))]
         }
@@ -442,12 +446,14 @@ impl Simd for Token {
         unsafe {
             let mut out = v;
             for h in 0..2 {
-                let (mut left, mut right) = ([v[0].0; 8], [v[0].0; 8]);
+                let mut left = [v[0].0; 8];
+                let mut right = [v[0].0; 8];
                 for i in 0..8 {
                     left[i] = v[8 * h + i].0;
                     right[i] = v[8 * h + i].1;
                 }
-                let (left, right) = (transpose8(left), transpose8(right));
+                let left = transpose8(left);
+                let right = transpose8(right);
                 for i in 0..8 {
                     if h == 0 {
                         out[i].0 = left[i];
@@ -473,8 +479,10 @@ unsafe fn halves(a: __m256, b: __m256) -> [__m256; 2] {
 #[inline(always)]
 unsafe fn transpose4(v: [__m256; 4]) -> [__m256; 4] {
     unsafe {
-        let (a, b) = (_mm256_unpacklo_ps(v[0], v[1]), _mm256_unpackhi_ps(v[0], v[1]));
-        let (c, d) = (_mm256_unpacklo_ps(v[2], v[3]), _mm256_unpackhi_ps(v[2], v[3]));
+        let a = _mm256_unpacklo_ps(v[0], v[1]);
+        let b = _mm256_unpackhi_ps(v[0], v[1]);
+        let c = _mm256_unpacklo_ps(v[2], v[3]);
+        let d = _mm256_unpackhi_ps(v[2], v[3]);
         [
             _mm256_shuffle_ps::<0x44>(a, c),
             _mm256_shuffle_ps::<0xee>(a, c),
@@ -489,7 +497,8 @@ unsafe fn transpose8(v: [__m256; 8]) -> [__m256; 8] {
     unsafe {
         let low = transpose4([v[0], v[1], v[2], v[3]]);
         let high = transpose4([v[4], v[5], v[6], v[7]]);
-        let (mut out, mut upper) = (low, high);
+        let mut out = low;
+        let mut upper = high;
         for i in 0..4 {
             out[i] = _mm256_permute2f128_ps::<0x20>(low[i], high[i]);
             upper[i] = _mm256_permute2f128_ps::<0x31>(low[i], high[i]);

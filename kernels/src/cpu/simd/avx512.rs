@@ -397,7 +397,8 @@ impl Simd for Token {
     #[inline(always)]
     fn interleave_quarters(self, even: F, odd: F) -> [F; 2] {
         unsafe {
-            let (even, odd) = (_mm512_castps_pd(even.0), _mm512_castps_pd(odd.0));
+            let even = _mm512_castps_pd(even.0);
+            let odd = _mm512_castps_pd(odd.0);
             let low = _mm512_setr_epi64(0, 1, 8, 9, 2, 3, 10, 11);
             let high = _mm512_setr_epi64(4, 5, 12, 13, 6, 7, 14, 15);
             let low = _mm512_permutex2var_pd(even, low, odd);
@@ -452,8 +453,10 @@ impl Simd for Token {
 #[inline(always)]
 unsafe fn transpose4(v: [__m512; 4]) -> [__m512; 4] {
     unsafe {
-        let (a, b) = (_mm512_unpacklo_ps(v[0], v[1]), _mm512_unpackhi_ps(v[0], v[1]));
-        let (c, d) = (_mm512_unpacklo_ps(v[2], v[3]), _mm512_unpackhi_ps(v[2], v[3]));
+        let a = _mm512_unpacklo_ps(v[0], v[1]);
+        let b = _mm512_unpackhi_ps(v[0], v[1]);
+        let c = _mm512_unpacklo_ps(v[2], v[3]);
+        let d = _mm512_unpackhi_ps(v[2], v[3]);
         [
             _mm512_shuffle_ps::<0x44>(a, c),
             _mm512_shuffle_ps::<0xee>(a, c),

@@ -10,7 +10,7 @@
 use super::{F32Vector, IntVector, LANES, Mask};
 use std::f32::consts::{FRAC_1_SQRT_2, FRAC_2_PI, LOG2_E};
 
-/// Implements the elementary functions of [`Vector`] by those of this module.
+/// Implements the elementary functions of [`super::Vector`] by those of this module.
 macro_rules! functions {
     () => {
         #[inline(always)]
@@ -50,7 +50,7 @@ pub(super) use functions;
 const ROUND: f32 = 12_582_912.0;
 /// Least argument of [`exp`] whose result is not 0: e^−87.3 is a normal number.
 const EXP_MIN: f32 = -87.3;
-/// Arguments of [`exp`] above count as this.
+/// Greatest argument of [`exp`]; greater ones give its result.
 const EXP_MAX: f32 = 88.0;
 /// ln 2 in two parts: products of the first with a whole exponent are exact.
 const LN_2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
@@ -59,7 +59,7 @@ const HALF_PI: [f32; 3] = [1.570_312_5, 4.837_513e-4, 7.549_79e-8];
 /// [`sin_cos`] takes the standard library's functions for arguments above.
 const SIN_COS_MAX: f32 = 8192.0;
 
-/// Σ coefficientsᵢ·xⁱ, highest power first.
+/// Evaluates a polynomial whose coefficients are given from the highest power down.
 #[inline(always)]
 fn polynomial<V: F32Vector, const N: usize>(x: V, coefficients: [f32; N]) -> V {
     let mut sum = V::splat(coefficients[0]);
@@ -224,20 +224,19 @@ pub(crate) fn sin_cos<V: F32Vector>(x: V) -> (V, V) {
     let sin = sin.fma(z * r, r);
     let cos = polynomial(z, [2.443_315_7e-5, -1.388_731_6e-3, 4.166_664_6e-2]);
     let cos = (z * z).fma(cos, z.fma(V::splat(-0.5), V::splat(1.0)));
-    let (quadrant, one) = (shifted.to_bits(), V::Int::splat(1));
+    let quadrant = shifted.to_bits();
+    let one = V::Int::splat(1);
     let odd = V::splat(0.5).lt(V::from_int(quadrant & one));
-    let near = (
-        with_sign_of_quadrant(odd.select(cos, sin), quadrant),
-        with_sign_of_quadrant(odd.select(sin, cos), quadrant + one),
-    );
+    let near_sin = with_sign_of_quadrant(odd.select(cos, sin), quadrant);
+    let near_cos = with_sign_of_quadrant(odd.select(sin, cos), quadrant + one);
     let far = V::splat(SIN_COS_MAX).lt(x.abs());
     if !far.any() {
-        return near;
+        return (near_sin, near_cos);
     }
     let mut lanes = [0.0; LANES];
     x.store(&mut lanes);
-    let [sin, cos] = sin_cos_far(lanes);
-    (far.select(V::load(&sin), near.0), far.select(V::load(&cos), near.1))
+    let [far_sin, far_cos] = sin_cos_far(lanes);
+    (far.select(V::load(&far_sin), near_sin), far.select(V::load(&far_cos), near_cos))
 }
 
 /// `v`, negated in quadrants 2 and 3.

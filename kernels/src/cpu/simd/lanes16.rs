@@ -201,7 +201,8 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// The inverse of [`Simd::columns_of_8`].
     #[inline(always)]
     fn rows_of_8(self, v: [Self::F; 8]) -> [Self::F; 8] {
-        let (mut even, mut odd) = ([v[0]; 4], [v[0]; 4]);
+        let mut even = [v[0]; 4];
+        let mut odd = [v[0]; 4];
         for i in 0..4 {
             [even[i], odd[i]] = self.interleave_quarters(v[i], v[4 + i]);
         }

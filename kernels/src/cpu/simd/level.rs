@@ -1,18 +1,10 @@
 //! Instruction sets: detection, names, and the calls that enter them.
 
-use super::Simd;
-#[cfg(not(any(
-    target_arch = "x86_64",
-    target_arch = "aarch64",
-    all(target_arch = "wasm32", target_feature = "simd128")
-)))]
-use super::array::Array;
 #[cfg(target_arch = "aarch64")]
 use super::neon;
-#[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-use super::simd128;
+use super::{BASELINE, Simd};
 #[cfg(target_arch = "x86_64")]
-use super::{avx2, avx512, sse2};
+use super::{avx2, avx512};
 use std::fmt;
 use std::sync::OnceLock;
 
@@ -52,12 +44,14 @@ impl std::error::Error for UnknownLevel {}
 /// An instruction set that kernels are compiled for.
 ///
 /// A new one needs a variant here, an entry in [`SimdLevel::available`], an arm in
-/// `SimdLevel::run`, and a module beside `avx2` that implements `Simd`.
+/// `SimdLevel::run`, and a module: beside `avx2` one that implements `Simd`, or, for registers
+/// of 128 bits, beside `neon` one that implements `quad::InstructionSet`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SimdLevel {
     /// The instructions that every processor of the target has: SSE2 on x86-64, NEON on
-    /// AArch64, simd128 on WebAssembly built with it. Products round separately.
-    Scalar,
+    /// AArch64, simd128 on WebAssembly built with it, on others what the compiler makes of
+    /// arrays. A vector is four registers. Products round separately.
+    Baseline,
     /// x86-64-v3: AVX2 and FMA. A vector is two registers.
     Avx2,
     /// x86-64-v4: AVX-512 F, BW, CD, DQ, VL. A vector is one register.
@@ -69,14 +63,14 @@ pub enum SimdLevel {
 impl SimdLevel {
     /// All levels, supported here or not.
     const ALL: [SimdLevel; 4] =
-        [SimdLevel::Scalar, SimdLevel::Avx2, SimdLevel::Avx512, SimdLevel::Neon];
+        [SimdLevel::Baseline, SimdLevel::Avx2, SimdLevel::Avx512, SimdLevel::Neon];
 
     /// Lists the levels that this processor supports, slowest first.
     pub fn available() -> &'static [SimdLevel] {
         static FOUND: OnceLock<Vec<SimdLevel>> = OnceLock::new();
         FOUND.get_or_init(|| {
             #[allow(unused_mut, reason = "targets other than these two have one level")]
-            let mut found = vec![SimdLevel::Scalar];
+            let mut found = vec![SimdLevel::Baseline];
             #[cfg(target_arch = "x86_64")]
             {
                 if avx2::detected() {
@@ -98,11 +92,11 @@ impl SimdLevel {
         static BEST: OnceLock<SimdLevel> = OnceLock::new();
         *BEST.get_or_init(|| {
             let requested = Self::requested().ok().flatten();
-            requested.or(Self::available().last().copied()).unwrap_or(SimdLevel::Scalar)
+            requested.or(Self::available().last().copied()).unwrap_or(SimdLevel::Baseline)
         })
     }
 
-    /// Returns the level that the environment variable `SUBSPLAT_SIMD` names (`scalar`, `avx2`,
+    /// Returns the level that the environment variable `SUBSPLAT_SIMD` names (`baseline`, `avx2`,
     /// `avx512`, `neon`), or `None` where the variable is absent or empty.
     ///
     /// # Errors
@@ -129,7 +123,7 @@ impl SimdLevel {
     /// Returns the level's name in `SUBSPLAT_SIMD`.
     pub fn name(self) -> &'static str {
         match self {
-            SimdLevel::Scalar => "scalar",
+            SimdLevel::Baseline => "baseline",
             SimdLevel::Avx2 => "avx2",
             SimdLevel::Avx512 => "avx512",
             SimdLevel::Neon => "neon",
@@ -141,7 +135,7 @@ impl SimdLevel {
         Self::available().contains(&self)
     }
 
-    /// Runs `kernel` compiled for this level, or for [`SimdLevel::Scalar`] where the
+    /// Runs `kernel` compiled for this level, or for [`SimdLevel::Baseline`] where the
     /// processor lacks it.
     ///
     /// Call it inside a parallel task, not around one: the compiler builds the code of
@@ -160,19 +154,8 @@ impl SimdLevel {
                 unsafe { avx2::run(kernel) }
             }
             #[cfg(target_arch = "aarch64")]
-            SimdLevel::Neon => kernel.run(neon::Token::<true>),
-            #[cfg(target_arch = "aarch64")]
-            _ => kernel.run(neon::Token::<false>),
-            #[cfg(target_arch = "x86_64")]
-            _ => kernel.run(sse2::Token),
-            #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-            _ => kernel.run(simd128::Token),
-            #[cfg(not(any(
-                target_arch = "x86_64",
-                target_arch = "aarch64",
-                all(target_arch = "wasm32", target_feature = "simd128")
-            )))]
-            _ => kernel.run(Array::<false>),
+            SimdLevel::Neon => kernel.run(neon::FUSED),
+            _ => kernel.run(BASELINE),
         }
     }
 }
@@ -222,7 +205,7 @@ mod tests {
         {
             let error = SimdLevel::here(name).unwrap_err().to_string();
             assert!(error.starts_with("SUBSPLAT_SIMD: expected"), "{error}");
-            assert!(error.contains("(scalar"), "{error}");
+            assert!(error.contains("(baseline"), "{error}");
             assert!(error.ends_with(&format!("got {name}")), "{error}");
         }
     }

@@ -1,6 +1,5 @@
-//! Every level against the scalar one: bit for bit where no operation is fused, and the
-//! fused levels bit for bit among themselves. Elementary functions against the standard
-//! library in f64.
+//! Every level against arrays of floats, with separate and with fused products, bit for bit.
+//! Elementary functions against the standard library in f64.
 
 use super::array::Array;
 use super::elementary::{erf, exp, exp_m1, exp2, exp2_by_sums, ln, ln_1p, log2, sin_cos, tanh};
@@ -27,10 +26,7 @@ fn numbers(seed: u32, n: usize) -> Vec<f32> {
 }
 
 fn lanes(v: &[f32], at: usize) -> &[f32; LANES] {
-    match v[at..].first_chunk() {
-        Some(v) => v,
-        None => unreachable!("numbers come in whole vectors"),
-    }
+    v[at..].first_chunk().expect("numbers come in whole vectors")
 }
 
 /// All operations on 16 lanes of each input; results as bits.
@@ -41,7 +37,8 @@ impl Kernel for Everything<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> Self::Output {
-        let (mut exact, mut fused) = (Vec::new(), Vec::new());
+        let mut exact = Vec::new();
+        let mut fused = Vec::new();
         let mut buffer = [0.0; LANES];
         let mut integers = [0; LANES];
         let mut put = |to: &mut Vec<u32>, v: S::F| {
@@ -94,7 +91,8 @@ impl Kernel for Everything<'_> {
             put(&mut exact, S::F::from_int(i));
             exact.push(s.sum(S::F::from_int(i)).to_bits());
             // Sums of many vectors equal the sum of each.
-            let (many, few) = (s.sums([small.floor(); LANES]), s.sums([a, b, c]));
+            let many = s.sums([small.floor(); LANES]);
+            let few = s.sums([a, b, c]);
             exact.extend([many[0], many[7], many[15]].map(f32::to_bits));
             for (sum, v) in few.into_iter().zip([a, b, c]) {
                 let same = sum.to_bits() == s.sum(v).to_bits();
@@ -173,7 +171,7 @@ fn levels_agree_to_the_bit() {
         let got = level.run(all());
         let at = got.0.iter().zip(&exact).position(|(a, b)| a != b);
         assert_eq!(at, None, "{level:?}");
-        let expected = if level == SimdLevel::Scalar { &separate } else { &fused };
+        let expected = if level == SimdLevel::Baseline { &separate } else { &fused };
         let at = got.1.iter().zip(expected).position(|(a, b)| a != b);
         assert_eq!(at, None, "{level:?}, fused");
     }
@@ -302,7 +300,7 @@ fn elementary_functions_are_good_to_a_few_ulp() {
     let single = x.iter().map(|x| functions_of(*x)).collect::<Vec<_>>();
     let levels = SimdLevel::available().iter().map(|level| level.run(Functions(&x)));
     for (level, got) in std::iter::once(single.clone()).chain(levels).enumerate() {
-        // Single numbers round products, as the scalar level does.
+        // Single numbers round products, as the baseline does.
         assert!(level != 1 || got == single);
         for (x, got) in x.iter().zip(got) {
             for (i, name) in NAMES.iter().enumerate() {
@@ -422,5 +420,5 @@ fn levels_have_names() {
     }
     assert_eq!(SimdLevel::named("mmx"), None);
     assert!(SimdLevel::best().is_available());
-    assert_eq!(SimdLevel::available()[0], SimdLevel::Scalar);
+    assert_eq!(SimdLevel::available()[0], SimdLevel::Baseline);
 }

@@ -1,4 +1,4 @@
-//! Numbers in lanes.
+//! The traits of vectors: numbers in lanes, and a truth value for each.
 
 use super::{LANES, Real, RowLayout, rows};
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
@@ -71,9 +71,11 @@ pub trait Vector:
     fn fma(self, b: Self, c: Self) -> Self;
     /// c − self·b; rounded once where the level fuses.
     fn fnma(self, b: Self, c: Self) -> Self;
-    /// other > self ? other : self. A NaN of `self` stays, one of `other` is ignored.
+    /// Returns `other` where it is greater than `self`, else `self`: a NaN of `self` stays,
+    /// one of `other` is ignored.
     fn max(self, other: Self) -> Self;
-    /// other < self ? other : self. A NaN of `self` stays, one of `other` is ignored.
+    /// Returns `other` where it is less than `self`, else `self`: a NaN of `self` stays, one
+    /// of `other` is ignored.
     fn min(self, other: Self) -> Self;
     /// Square root.
     fn sqrt(self) -> Self;

@@ -252,9 +252,9 @@ fn an_unknown_simd_level() {
         assert_eq!(called.code, 1, "{}", called.stderr);
         let error = called.error();
         assert!(error.starts_with("error: SUBSPLAT_SIMD: expected "), "{error}");
-        assert!(error.contains("scalar") && error.ends_with("got axv2"), "{error}");
+        assert!(error.contains("baseline") && error.ends_with("got axv2"), "{error}");
         assert_eq!(format!("error: {}", called.json()["error"].as_str().unwrap()), error);
     }
-    let called = call_with(place.path(), &["info", "scene"], &[("SUBSPLAT_SIMD", "scalar")]);
+    let called = call_with(place.path(), &["info", "scene"], &[("SUBSPLAT_SIMD", "baseline")]);
     assert_eq!(called.code, 0, "{}", called.stderr);
 }

@@ -65,7 +65,7 @@ impl Command {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum SimdArg {
     /// Instructions of every processor of the kind; products and sums round separately.
-    Scalar,
+    Baseline,
     /// x86-64-v3.
     Avx2,
     /// x86-64-v4.
@@ -77,7 +77,7 @@ pub enum SimdArg {
 impl From<SimdArg> for subsplat_kernels::cpu::SimdLevel {
     fn from(arg: SimdArg) -> Self {
         match arg {
-            SimdArg::Scalar => Self::Scalar,
+            SimdArg::Baseline => Self::Baseline,
             SimdArg::Avx2 => Self::Avx2,
             SimdArg::Avx512 => Self::Avx512,
             SimdArg::Neon => Self::Neon,
