@@ -19,7 +19,7 @@ use subsplat::network::model::weights::Weights;
 use subsplat::network::model::{Backend, Views};
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 use subsplat_kernels::gpu::{
-    DeviceArray, FULL_GRID, Gpu, GpuError, NormSum, PointwiseFunction, Recorder, Work,
+    Array, FULL_GRID, Gpu, GpuError, NormSum, PointwiseFunction, Recorder, Work,
 };
 
 /// Class of adapters, its f32 rate in flop/s, and its memory's rate in bytes/s (data sheets).
@@ -159,7 +159,7 @@ const CALLS: usize = 10;
 const REPEATS: usize = 7;
 
 /// A kernel on arrays of its device: gradients have the last one as the upstream gradient.
-type Call = fn(&[DeviceArray; 4]) -> Result<(), GpuError>;
+type Call = fn(&[Array; 4]) -> Result<(), GpuError>;
 
 const REDUCTIONS: [(&str, [usize; 4], Call); 6] = [
     ("group norm", [2, 64, 128, 128], |[x, f, s, _]| {
@@ -172,7 +172,7 @@ const REDUCTIONS: [(&str, [usize; 4], Call); 6] = [
         x.reshape(&[64 * 128, 128])?.layer_norm([f, s], NormSum::None).map(drop)
     }),
     ("layer norm backward", [1, 128, 64, 128], |[x, f, _, dy]| {
-        let rows = |a: &DeviceArray| a.reshape(&[64 * 128, 128]);
+        let rows = |a: &Array| a.reshape(&[64 * 128, 128]);
         rows(x)?.layer_norm_backward(f, &rows(dy)?).map(drop)
     }),
     ("softmax of 32", [64, 64, 16, 32], |[x, ..]| x.softmax().map(drop)),

@@ -8,10 +8,8 @@ use adapter::{gpu, limited};
 use raster_scene::{Kind, Random, Scene};
 use std::sync::Arc;
 use subsplat_kernels::camera::Camera;
-use subsplat_kernels::gpu::{Gpu, GpuError, Rasterizer};
-use subsplat_kernels::layout::{
-    Convention, FOOTPRINT_STRIDE, PAIR_SUMS, RasterOptions, ShDirection, SplatSlices,
-};
+use subsplat_kernels::gpu::{FOOTPRINT_STRIDE, Gpu, GpuError, PAIR_SUMS, Rasterizer};
+use subsplat_kernels::layout::{Convention, RasterOptions, ShDirection, SplatSlices};
 
 /// Size of a binding, bytes: 1,365 footprints, 16,384 pairs forward and 1,638 backward, and one
 /// row of tiles of [`WIDTH`] pixels.

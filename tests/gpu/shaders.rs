@@ -1,171 +1,23 @@
-//! Checks of the WGSL kernels without a GPU. naga validates every kernel; constants, uniforms and
-//! arguments equal those of the Rust side; kernels respect WebGPU's default limits; every kernel
-//! has a CPU version.
+//! Checks of the WGSL kernels without a GPU. naga validates every kernel, and agrees with the crate
+//! about arguments, uniforms and constants; kernels respect WebGPU's default limits; every file
+//! belongs to a kernel and names its CPU version.
 
 use naga::proc::Layouter;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
-use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, TypeInner};
-use std::collections::{BTreeMap, BTreeSet};
+use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess};
 use std::fs;
-use std::path::PathBuf;
-use subsplat_kernels::gpu::{Access, KERNELS, Kernel};
-use subsplat_kernels::layout as abi;
-use subsplat_kernels::layout::*;
+use std::path::{Path, PathBuf};
+use subsplat_kernels::gpu::{Access, KERNELS, Kernel, PAIR_SUMS};
+use subsplat_kernels::layout::{ALPHA_MIN, AREA_SQ_EPS, OPACITY_MAX, OpacityRule};
 
 /// WebGPU's default limits: storage buffers per stage, threads and bytes per workgroup.
 const STORAGE_MAX: usize = 8;
 const THREADS_MAX: u32 = 256;
 const WORKGROUP_BYTES_MAX: u32 = 16 << 10;
 
-/// Kernels whose CPU version has another stem.
-const CPU_STEMS: &[(&str, &str)] = &[
-    ("adapter_colours", "adapter"),
-    ("sort_count", "sort"),
-    ("sort_scatter", "sort"),
-    ("scan_reduce", "tiles"),
-    ("scan_whole", "tiles"),
-    ("scan_apply", "tiles"),
-    ("plan", "tiles"),
-    ("pick", "tiles"),
-    ("intersect", "tiles"),
-    ("ranges", "tiles"),
-    ("rasterize_bwd", "raster_bwd"),
-    ("pair_sums", "raster_bwd"),
-    ("redistribute_bwd", "redistribute"),
-    ("show", "rasterize"),
-    ("spgr_bwd", "spgr"),
-    ("spgr_gains_bwd", "spgr"),
-    ("invert", "plane_sweep"),
-    ("attention_gather_bwd", "attention_gather"),
-    ("attention_gather_scatter", "attention_gather"),
-    ("plane_sweep_taps", "plane_sweep"),
-    ("plane_sweep_reference_bwd", "plane_sweep"),
-    ("plane_sweep_source_bwd", "plane_sweep"),
-    ("convex", "small"),
-    ("convolution", "conv"),
-    ("cross_check", "small"),
-    ("depth_consensus", "small"),
-    // Copies and sums of tensors.
-    ("elementwise", "activation"),
-    ("expectation", "small"),
-    ("head_output", "small"),
-    ("layer_norm", "norm"),
-    ("linear", "gemm"),
-    ("norm_apply", "norm"),
-    ("norm_statistics", "norm"),
-    ("raw_matching_blocks", "matching"),
-    ("raw_matching_scores", "matching"),
-    ("reduce", "moves"),
-    ("select_rows", "moves"),
-    ("occlusion", "attention_gather"),
-    ("attributes_bwd", "attributes"),
-    ("convex_bwd", "small"),
-    ("convex_maps_bwd", "small"),
-    ("convolution_weight_bwd", "conv"),
-    ("expectation_bwd", "small"),
-    ("layer_norm_bwd", "norm"),
-    ("linear_weight_bwd", "gemm"),
-    ("norm_bwd", "norm"),
-    ("norm_sums_bwd", "norm"),
-    ("resize_bwd", "resize"),
-    ("select_rows_bwd", "moves"),
-    ("sum_parts", "sums"),
-];
-
-/// Returns name and value of every constant of kernels/shared/abi.wgsl.
-fn constants() -> BTreeMap<&'static str, f64> {
-    macro_rules! same {
-        ($($name:ident),* $(,)?) => { [$((stringify!($name), f64::from(abi::$name as f32))),*] };
-    }
-    let mut all = BTreeMap::from(same!(
-        AREA_EPS,
-        AREA_RULE_OPACITY_MAX,
-        OPACITY_CEILING,
-        RELATIVE_AREA_MIN,
-        ALPHA_MIN,
-        ALPHA_MIN_LOG2,
-        DISCRIMINANT_MIN_MVSPLAT,
-        RADIUS_SIGMAS_MVSPLAT,
-        SUPPORT_SLACK,
-        SPAN_SLACK_PX,
-        OPACITY_MAX,
-        TILE_GPU,
-        FOOTPRINT_STRIDE,
-        PAIR_SUMS,
-        GPU_BLOCK,
-        PLAN_COUNT,
-        PLAN_BLOCKS,
-        PLAN_REQUESTED,
-        PLAN_ELEMENT_GROUPS,
-    ));
-    let rules = [
-        ("RULE_LINEAR", OpacityRule::Linear),
-        ("RULE_OPTICAL_DEPTH", OpacityRule::OpticalDepth),
-        ("RULE_TRANSMITTANCE", OpacityRule::Transmittance),
-        ("RULE_AREA", OpacityRule::Area),
-        ("RULE_NONE", OpacityRule::None),
-    ];
-    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_STRIDE));
-    all.extend(same!(SPLAT_STRIDE, MEAN_OFFSET, QUAT_OFFSET, SCALE_OFFSET, OPACITY_OFFSET));
-    all.extend(same!(
-        HEAD_STRIDE,
-        HEAD_UV_OFFSET,
-        HEAD_DEPTH_OFFSET,
-        HEAD_LOG_SCALE_OFFSET,
-        HEAD_ROTATION_OFFSET
-    ));
-    all.extend(same!(
-        HEAD_LOGIT_OFFSET,
-        HEAD_GAIN_OFFSET,
-        NONE,
-        SPGR_CAMERA_STRIDE,
-        AREA_SQ_EPS,
-        GROWTH_MAX
-    ));
-    all.extend(same!(DEPTH_FRACTION_MIN, DISC_AREA_SQ_MIN, VISIBLE_Z_MIN));
-    all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
-    all
-}
-
-/// Name, size, and fields with offsets of a uniform.
-type Uniform = (&'static str, usize, &'static [(&'static str, usize)]);
-
-macro_rules! uniforms {
-    ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
-}
-
-const UNIFORMS: &[Uniform] = uniforms!(
-    AdamUniform,
-    AdapterUniform,
-    AttentionGatherUniform,
-    AttentionUniform,
-    AttributesUniform,
-    ConvexUniform,
-    ConvolutionUniform,
-    CrossCheckUniform,
-    DepthConsensusUniform,
-    ElementwiseUniform,
-    ExpectationUniform,
-    HeadOutputUniform,
-    InvertUniform,
-    LinearUniform,
-    LinearWeightBwdUniform,
-    OcclusionUniform,
-    NormUniform,
-    PlaneSweepUniform,
-    RasterUniform,
-    RawMatchingUniform,
-    RedistributeUniform,
-    ReduceUniform,
-    ResizeUniform,
-    RowsUniform,
-    SelectUniform,
-    ShowUniform,
-    SortUniform,
-    SpgrGainsBwdUniform,
-    SpgrUniform,
-    SumPartsUniform
-);
+/// Folders of the Rust kernels (`cpu`, `gpu`) and of the WGSL (`wgsl`).
+const RUST: &str = "kernels/src";
+const WGSL: &str = "kernels";
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -175,13 +27,6 @@ fn parse(source: &str) -> Result<Module, String> {
     naga::front::wgsl::parse_str(source).map_err(|e| e.emit_to_string(source))
 }
 
-/// Returns the sources of a kernel, and what each needs of a device.
-fn sources(kernel: &Kernel) -> impl Iterator<Item = (&'static str, Capabilities)> {
-    let plain = (kernel.source.plain, Capabilities::empty());
-    let subgroups = kernel.source.subgroups.map(|source| (source, Capabilities::SUBGROUP));
-    std::iter::once(plain).chain(subgroups)
-}
-
 fn validate(source: &str, capabilities: Capabilities) -> Result<Module, String> {
     let module = parse(source)?;
     let mut validator = Validator::new(ValidationFlags::all(), capabilities);
@@ -189,113 +34,46 @@ fn validate(source: &str, capabilities: Capabilities) -> Result<Module, String> 
     Ok(module)
 }
 
-fn value(module: &Module, init: Handle<Expression>) -> f64 {
-    match module.global_expressions[init] {
-        Expression::Literal(Literal::F32(v)) => f64::from(v),
-        Expression::Literal(Literal::U32(v)) => f64::from(v),
-        Expression::Literal(Literal::I32(v)) => f64::from(v),
-        Expression::Literal(Literal::AbstractInt(v)) => v as f64,
-        Expression::Literal(Literal::AbstractFloat(v)) => v,
-        ref other => panic!("a constant that is not a number: {other:?}"),
+fn kernel(name: &str) -> &'static Kernel {
+    KERNELS.iter().find(|kernel| kernel.name == name).unwrap()
+}
+
+/// Returns without and with subgroup operations: whether the source is for devices that have them,
+/// and what it needs of a device. Most kernels have one source.
+fn variants(kernel: &Kernel) -> Vec<(bool, Capabilities)> {
+    let mut all = vec![(false, Capabilities::empty())];
+    if kernel.source.subgroups.is_some() {
+        all.push((true, Capabilities::SUBGROUP));
     }
+    all
 }
 
-/// Returns the differences between the constants of `module` and those of `abi`.
-fn constant_differences(module: &Module) -> Vec<String> {
-    let mut ours = constants();
-    let mut wrong = Vec::new();
-    for (_, c) in module.constants.iter() {
-        let name = c.name.clone().unwrap();
-        let theirs = value(module, c.init);
-        match ours.remove(name.as_str()) {
-            Some(v) if v as f32 == theirs as f32 => {}
-            Some(v) => wrong.push(format!("{name}: {v} in Rust, {theirs} in WGSL")),
-            None => wrong.push(format!("{name} is not in this test's table")),
-        }
-    }
-    wrong.extend(ours.keys().map(|name| format!("{name} is not in abi.wgsl")));
-    wrong
-}
-
-#[test]
-fn constants_match_abi() {
-    let text = fs::read_to_string(root().join("kernels/shared/abi.wgsl")).unwrap();
-    assert_eq!(constant_differences(&parse(&text).unwrap()), Vec::<String>::new());
-    let changed = text.replace("0.9999;", "0.999;");
-    assert_eq!(
-        constant_differences(&parse(&changed).unwrap()).len(),
-        1,
-        "a changed constant passes"
-    );
-    let named = text.replace("const AREA_EPS", "const AREA_EPSILON");
-    assert_eq!(constant_differences(&parse(&named).unwrap()).len(), 2, "a renamed constant passes");
-}
-
-/// Returns the differences between the uniforms of `module` and those of `abi`, and the names
-/// compared.
-fn uniform_differences(module: &Module) -> (Vec<String>, BTreeSet<String>) {
-    let (mut wrong, mut seen) = (Vec::new(), BTreeSet::new());
-    for (_, variable) in module.global_variables.iter() {
-        if variable.space != AddressSpace::Uniform {
-            continue;
-        }
-        let ty = &module.types[variable.ty];
-        let name = ty.name.clone().unwrap_or_default();
-        let TypeInner::Struct { members, span } = &ty.inner else {
-            wrong.push(format!("uniform {:?} is not a struct", variable.name));
-            continue;
+/// Returns binding and access of a module's arguments, in the order of their bindings.
+fn arguments(module: &Module) -> Vec<(u32, Access)> {
+    let argument = |(_, variable): (_, &naga::GlobalVariable)| {
+        let binding = variable.binding.as_ref()?;
+        assert_eq!(binding.group, 0, "{:?}: group 0 alone is used", variable.name);
+        let access = match variable.space {
+            AddressSpace::Uniform => Access::Uniform,
+            AddressSpace::Storage { access } if access.contains(StorageAccess::STORE) => {
+                Access::Write
+            }
+            AddressSpace::Storage { .. } => Access::Read,
+            other => panic!("{:?} in {other:?}", variable.name),
         };
-        let Some((_, size, fields)) = UNIFORMS.iter().find(|(n, ..)| *n == name) else {
-            wrong.push(format!("uniform {name} is not in this test's table"));
-            continue;
-        };
-        let theirs: Vec<_> =
-            members.iter().map(|m| (m.name.as_deref().unwrap(), m.offset as usize)).collect();
-        if theirs != *fields || *span as usize != *size {
-            wrong.push(format!("{name}: {fields:?}, {size} bytes; WGSL {theirs:?}, {span}"));
-        }
-        seen.insert(name);
-    }
-    (wrong, seen)
+        Some((binding.binding, access))
+    };
+    let mut all: Vec<_> = module.global_variables.iter().filter_map(argument).collect();
+    all.sort_by_key(|(binding, _)| *binding);
+    all
 }
 
-#[test]
-fn uniforms_match_abi() {
-    let mut seen = BTreeSet::new();
-    for kernel in KERNELS {
-        let (wrong, names) = uniform_differences(&parse(kernel.source.plain).unwrap());
-        assert_eq!(wrong, Vec::<String>::new(), "{}", kernel.name);
-        seen.extend(names);
-    }
-    let all: BTreeSet<String> = UNIFORMS.iter().map(|(name, ..)| (*name).to_owned()).collect();
-    assert_eq!(seen, all, "a uniform of the table belongs to no kernel");
-    let redistribute = KERNELS.iter().find(|k| k.name == "redistribute").unwrap();
-    let swapped = redistribute
-        .source
-        .plain
-        .replace("parents: u32,\n    children: u32,", "children: u32, parents: u32,");
-    assert_ne!(swapped, redistribute.source.plain);
-    assert_eq!(uniform_differences(&parse(&swapped).unwrap()).0.len(), 1, "swapped fields pass");
-}
-
-/// Returns the access of a module's arguments, by binding.
-fn arguments(module: &Module) -> BTreeMap<u32, Access> {
-    let variables = module.global_variables.iter();
-    variables
-        .filter_map(|(_, v)| {
-            let binding = v.binding.as_ref()?;
-            assert_eq!(binding.group, 0, "{:?}: group 0 alone is used", v.name);
-            let access = match v.space {
-                AddressSpace::Uniform => Access::Uniform,
-                AddressSpace::Storage { access } if access.contains(StorageAccess::STORE) => {
-                    Access::Write
-                }
-                AddressSpace::Storage { .. } => Access::Read,
-                other => panic!("{:?} in {other:?}", v.name),
-            };
-            Some((binding.binding, access))
-        })
-        .collect()
+/// Returns name and size of a module's uniform.
+fn uniform(module: &Module) -> Option<(String, usize)> {
+    let mut variables = module.global_variables.iter().map(|(_, variable)| variable);
+    let variable = variables.find(|variable| variable.space == AddressSpace::Uniform)?;
+    let ty = &module.types[variable.ty];
+    Some((ty.name.clone().unwrap_or_default(), ty.inner.size(module.to_ctx()) as usize))
 }
 
 /// Returns the threads and the bytes of a kernel's workgroup.
@@ -309,21 +87,94 @@ fn workgroup(kernel: &Kernel, module: &Module) -> (u32, u32) {
     (entry.workgroup_size.iter().product(), shared.map(|v| layouter[v.ty].size).sum())
 }
 
-fn check_kernel(kernel: &Kernel) {
-    let name = kernel.name;
-    for (source, capabilities) in sources(kernel) {
-        let module = validate(source, capabilities).unwrap_or_else(|e| panic!("{name}: {e}"));
-        let ours: BTreeMap<u32, Access> = (0..).zip(kernel.bindings.iter().copied()).collect();
-        assert_eq!(arguments(&module), ours, "{name}: arguments");
-        let storage = kernel.bindings.iter().filter(|a| **a != Access::Uniform).count();
-        assert!(storage <= STORAGE_MAX, "{name}: {storage} storage buffers");
-        let (threads, bytes) = workgroup(kernel, &module);
-        assert!(threads <= THREADS_MAX, "{name}: {threads} threads");
-        assert!(bytes <= WORKGROUP_BYTES_MAX, "{name}: {bytes} bytes of workgroup memory");
+#[test]
+fn every_kernel_is_valid_and_within_the_default_limits() {
+    assert!(!KERNELS.is_empty());
+    for kernel in KERNELS {
+        let name = kernel.name;
+        for (subgroups, capabilities) in variants(kernel) {
+            let source = kernel.source.text(subgroups);
+            let module = validate(&source, capabilities).unwrap_or_else(|e| panic!("{name}: {e}"));
+            let (threads, bytes) = workgroup(kernel, &module);
+            assert!(threads <= THREADS_MAX, "{name}: {threads} threads");
+            assert!(bytes <= WORKGROUP_BYTES_MAX, "{name}: {bytes} bytes of workgroup memory");
+        }
+    }
+    let none = Capabilities::empty();
+    assert!(validate("fn f() -> f32 { return 1u; }", none).is_err(), "naga accepts invalid WGSL");
+}
+
+/// The declarations that the bind group layouts are made of are those that naga finds, and binding
+/// i is argument i.
+#[test]
+fn arguments_are_those_that_naga_finds() {
+    for kernel in KERNELS {
+        for (subgroups, _) in variants(kernel) {
+            let naga = arguments(&parse(&kernel.source.text(subgroups)).unwrap());
+            let mut ours = kernel.source.bindings(subgroups);
+            ours.sort_by_key(|(binding, _)| *binding);
+            assert_eq!(ours, naga, "{}", kernel.name);
+            let numbers: Vec<_> = ours.iter().map(|(binding, _)| *binding as usize).collect();
+            assert_eq!(numbers, (0..ours.len()).collect::<Vec<_>>(), "{}", kernel.name);
+            let storage = ours.iter().filter(|(_, access)| *access != Access::Uniform).count();
+            assert!(storage <= STORAGE_MAX, "{}: {storage} storage buffers", kernel.name);
+        }
+    }
+    let adam = kernel("adam").source.bindings(false);
+    assert_eq!(adam.len(), 8);
+    assert_eq!(adam[0], (0, Access::Uniform));
+    assert_eq!(adam[1], (1, Access::Read));
+    assert_eq!(adam[7], (7, Access::Write));
+}
+
+/// The compiler checks offsets where a uniform is declared; naga's size includes the last field's end.
+#[test]
+fn uniforms_have_the_size_that_naga_finds() {
+    for kernel in KERNELS {
+        let ours = kernel.source.uniform.map(|ours| (ours.name.to_owned(), ours.bytes));
+        assert_eq!(uniform(&parse(&kernel.source.text(false)).unwrap()), ours, "{}", kernel.name);
     }
 }
 
-/// Stages of the table in kernels/src/gpu/mod.rs, and their largest kernel.
+fn value(module: &Module, init: Handle<Expression>) -> f64 {
+    match module.global_expressions[init] {
+        Expression::Literal(Literal::F32(v)) => f64::from(v),
+        Expression::Literal(Literal::U32(v)) => f64::from(v),
+        ref other => panic!("a constant that is not a number: {other:?}"),
+    }
+}
+
+/// naga reads the digits of the constants as the same numbers, at the ends of both ranges too.
+#[test]
+fn constants_have_the_values_of_rust() {
+    let module = parse(&kernel("scan_whole").source.text(false)).unwrap();
+    let constant = |name: &str| {
+        let mut all = module.constants.iter().map(|(_, constant)| constant);
+        value(&module, all.find(|constant| constant.name.as_deref() == Some(name)).unwrap().init)
+    };
+    assert_eq!(constant("ALPHA_MIN"), f64::from(ALPHA_MIN));
+    assert_eq!(constant("AREA_SQ_EPS"), f64::from(AREA_SQ_EPS as f32));
+    assert_eq!(constant("OPACITY_MAX"), f64::from(OPACITY_MAX));
+    assert_eq!(constant("NONE"), f64::from(u32::MAX));
+    assert_eq!(constant("PAIR_SUMS"), PAIR_SUMS as f64);
+    assert_eq!(constant("RULE_AREA"), f64::from(OpacityRule::Area as u32));
+}
+
+/// No device without subgroup operations compiles a kernel that needs them, and the other source of
+/// such a kernel uses them.
+#[test]
+fn subgroup_operations_are_in_their_own_source() {
+    let both: Vec<_> = KERNELS.iter().filter(|k| k.source.subgroups.is_some()).collect();
+    assert!(!both.is_empty());
+    for kernel in both {
+        for (subgroups, _) in variants(kernel) {
+            let without = validate(&kernel.source.text(subgroups), Capabilities::empty());
+            assert_eq!(without.is_err(), subgroups, "{}", kernel.name);
+        }
+    }
+}
+
+/// Stages of the table in gpu/mod.rs, and their largest kernel.
 const STAGES: &[(&str, &str)] = &[
     ("project", "project"),
     ("sort by depth", "sort_scatter"),
@@ -331,8 +182,8 @@ const STAGES: &[(&str, &str)] = &[
     ("intersect", "intersect"),
     ("sort by tile", "sort_count"),
     ("ranges", "ranges"),
-    ("rasterize", "rasterize"),
-    ("rasterize backward", "rasterize_bwd"),
+    ("rasterize", "blend"),
+    ("rasterize backward", "blend_bwd"),
     ("sum pairs", "pair_sums"),
     ("project backward", "project_bwd"),
 ];
@@ -343,8 +194,8 @@ fn stage_differences(docs: &str) -> Vec<&'static str> {
     let cells = |line: &str| line.split('|').map(|c| c.trim().to_owned()).collect::<Vec<_>>();
     let rows: Vec<_> = docs.lines().map(cells).filter(|c| c.len() == 8).collect();
     let wrong = |(stage, name): &(&str, &str)| {
-        let kernel = KERNELS.iter().find(|k| k.name == *name).unwrap();
-        let (threads, bytes) = workgroup(kernel, &parse(kernel.source.plain).unwrap());
+        let kernel = kernel(name);
+        let (threads, bytes) = workgroup(kernel, &parse(&kernel.source.text(false)).unwrap());
         let concurrent = |most: u32, memory: u32| (most / threads).min(memory / bytes.max(1));
         let expected = [
             threads.to_string(),
@@ -361,7 +212,7 @@ fn stage_differences(docs: &str) -> Vec<&'static str> {
 
 #[test]
 fn the_table_of_stages_matches_the_kernels() {
-    let docs = fs::read_to_string(root().join("kernels/src/gpu/mod.rs")).unwrap();
+    let docs = fs::read_to_string(root().join(RUST).join("gpu/mod.rs")).unwrap();
     assert_eq!(stage_differences(&docs), Vec::<&str>::new());
     assert_eq!(stage_differences(&docs.replace("15,368", "15,372")), ["rasterize backward"]);
     assert_eq!(
@@ -370,75 +221,57 @@ fn the_table_of_stages_matches_the_kernels() {
     );
 }
 
-#[test]
-fn every_kernel_is_valid_and_within_the_default_limits() {
-    assert!(!KERNELS.is_empty());
-    for kernel in KERNELS {
-        check_kernel(kernel);
-    }
-    let none = Capabilities::empty();
-    assert!(validate("fn f() -> f32 { return 1u; }", none).is_err(), "naga accepts invalid WGSL");
-}
-
-/// No device without subgroup operations compiles a kernel that needs them, and the other source of such a
-/// kernel uses them.
-#[test]
-fn subgroup_operations_are_in_their_own_source() {
-    let both: Vec<_> = KERNELS.iter().filter(|k| k.source.subgroups.is_some()).collect();
-    assert!(!both.is_empty());
-    for kernel in both {
-        for (source, needs) in sources(kernel) {
-            let without = validate(source, Capabilities::empty());
-            assert_eq!(without.is_err(), needs == Capabilities::SUBGROUP, "{}", kernel.name);
+/// Returns folder, stem and text of every WGSL file.
+fn files() -> Vec<(String, String, String)> {
+    let name = |path: &Path| path.file_stem().unwrap().to_string_lossy().into_owned();
+    let entries = |path: &Path| fs::read_dir(path).unwrap().map(|e| e.unwrap().path());
+    let mut all = Vec::new();
+    for folder in entries(&root().join(WGSL).join("wgsl")) {
+        for file in entries(&folder) {
+            all.push((name(&folder), name(&file), fs::read_to_string(&file).unwrap()));
         }
     }
+    all
 }
 
-/// Returns the stems of the files of a folder with this extension.
-fn stems(folder: &str, extension: &str) -> BTreeSet<String> {
-    let files = fs::read_dir(root().join(folder)).unwrap().map(|e| e.unwrap().path());
-    files
-        .filter(|p| p.extension().is_some_and(|e| e == extension))
-        .map(|p| p.file_stem().unwrap().to_string_lossy().into_owned())
-        .collect()
+/// Kernels contain whole files, and the last file of a kernel has its name.
+#[test]
+fn every_file_belongs_to_a_kernel() {
+    for (folder, stem, text) in files() {
+        let holds = |kernel: &&Kernel| {
+            let all = variants(kernel);
+            let mut sources = all.iter().map(|(subgroups, _)| kernel.source.files(*subgroups));
+            if folder == "shared" {
+                sources.any(|files| files.contains(&text.as_str()))
+            } else {
+                kernel.name == stem && sources.all(|files| files.last() == Some(&text.as_str()))
+            }
+        };
+        assert!(KERNELS.iter().copied().any(|kernel| holds(&kernel)), "wgsl/{folder}/{stem}.wgsl");
+    }
 }
 
-/// Returns the kernels without a Rust side or without a CPU version.
-fn orphans(kernels: &BTreeSet<String>) -> Vec<String> {
-    let used: BTreeSet<&str> = KERNELS.iter().map(|k| k.name).collect();
-    let mut cpu = stems("src/cpu", "rs");
-    let folders = fs::read_dir(root().join("src/cpu")).unwrap().map(|e| e.unwrap().path());
-    cpu.extend(
-        folders
-            .filter(|p| p.is_dir())
-            .map(|p| p.file_name().unwrap().to_string_lossy().into_owned()),
-    );
-    let has_cpu_version = |stem: &str| {
-        let other = CPU_STEMS.iter().find(|(kernel, _)| *kernel == stem);
-        cpu.contains(other.map_or(stem, |(_, cpu_stem)| *cpu_stem))
+/// Returns the paths in the comments of a WGSL file that do not exist.
+fn missing_paths(text: &str) -> Vec<&str> {
+    let comments = text.lines().filter_map(|line| line.trim_start().strip_prefix("//"));
+    let words = comments.flat_map(str::split_whitespace);
+    let paths = words.map(|word| word.trim_matches(|c: char| !c.is_alphanumeric()));
+    let missing = |path: &&str| match path.split('/').next() {
+        Some("cpu" | "gpu") => path.contains('/') && !root().join(RUST).join(path).exists(),
+        Some("wgsl") => path.contains('/') && !root().join(WGSL).join(path).exists(),
+        _ => false,
     };
-    kernels.iter().filter(|k| !used.contains(k.as_str()) || !has_cpu_version(k)).cloned().collect()
+    paths.filter(missing).collect()
 }
 
 #[test]
-fn every_kernel_has_a_cpu_version() {
-    let mut kernels = stems("kernels", "wgsl");
-    assert_eq!(orphans(&kernels), Vec::<String>::new());
-    for kernel in KERNELS {
-        assert!(kernels.contains(kernel.name), "kernels/{}.wgsl is missing", kernel.name);
+fn every_kernel_names_its_cpu_version() {
+    for (folder, stem, text) in files() {
+        assert_eq!(missing_paths(&text), Vec::<&str>::new(), "wgsl/{folder}/{stem}.wgsl");
+        let header: Vec<_> = text.lines().take_while(|line| line.starts_with("//")).collect();
+        let header = header.join(" ").replace("// ", "");
+        let named = header.contains("CPU version") || folder == "shared";
+        assert!(named, "wgsl/{folder}/{stem}.wgsl names no CPU version");
     }
-    kernels.insert("stray".to_owned());
-    assert_eq!(orphans(&kernels), ["stray"]);
-}
-
-/// Kernels contain whole files: each file of kernels/shared is part of some kernel.
-#[test]
-fn shared_files_are_used() {
-    for stem in stems("kernels/shared", "wgsl") {
-        let text = fs::read_to_string(root().join(format!("kernels/shared/{stem}.wgsl"))).unwrap();
-        assert!(
-            KERNELS.iter().any(|k| sources(k).any(|(source, _)| source.contains(&text))),
-            "shared/{stem}.wgsl"
-        );
-    }
+    assert_eq!(missing_paths("// CPU version: cpu/nowhere.rs."), ["cpu/nowhere.rs"]);
 }

@@ -7,7 +7,7 @@ use subsplat_test_support::gpu::{gpu, without_subgroups};
 
 use candle_core::Tensor;
 use std::sync::Arc;
-use subsplat_kernels::gpu::{DeviceArray, Gpu, NormSum, PointwiseFunction, Recorder};
+use subsplat_kernels::gpu::{Array, Gpu, NormSum, PointwiseFunction, Recorder};
 
 /// Opens the adapter with and without subgroup operations; `None`, loudly, where it has none.
 fn both() -> Option<[Arc<Gpu>; 2]> {
@@ -20,7 +20,7 @@ fn both() -> Option<[Arc<Gpu>; 2]> {
     Some([with, without])
 }
 
-fn upload(recorder: &Arc<Recorder>, t: &Tensor) -> DeviceArray {
+fn upload(recorder: &Arc<Recorder>, t: &Tensor) -> Array {
     recorder.upload(&crate::array::values(t), t.dims()).unwrap()
 }
 
@@ -29,7 +29,7 @@ fn assert_same_bits(
     name: &str,
     devices: &[Arc<Gpu>; 2],
     tensors: &[&Tensor],
-    f: impl Fn(&[DeviceArray]) -> Vec<DeviceArray>,
+    f: impl Fn(&[Array]) -> Vec<Array>,
 ) {
     let [with, without] = devices.each_ref().map(|gpu| {
         let recorder = Recorder::new(gpu.clone());

@@ -13,7 +13,7 @@
 //! | none | α | unused |
 //!
 //! Logarithms clamp α to 0.9999. Each lane of a vector ([`super::simd`]) is a parent, so
-//! that a sum over children is a loop. WGSL: kernels/redistribute.wgsl,
+//! that a sum over children is a loop. WGSL: wgsl/spgr/redistribute.wgsl,
 //! kernels/src/gpu/redistribute.rs. Op: ops/redistribute.rs.
 
 use super::simd::{LANES, Mask, Real, RowLayout, Vector, VectorKernel};

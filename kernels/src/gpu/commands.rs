@@ -3,7 +3,8 @@
 use crate::gpu::buffers::{Binding, Buffer, Reading};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Constants, Kernel, Pipeline};
+use crate::gpu::kernel::Kernel;
+use crate::gpu::pipelines::{Constants, Pipeline};
 use bytemuck::Pod;
 use std::marker::PhantomData;
 use std::sync::Arc;
@@ -21,7 +22,7 @@ pub(crate) enum Groups {
 impl Groups {
     /// Returns workgroups of `size` threads for at least `count` threads. Counts above the limit
     /// of one dimension (WebGPU: 65,535) are spread over x and y; kernels compute the index with
-    /// `workgroup_number` of kernels/shared/grid.wgsl.
+    /// `workgroup_number` of wgsl/shared/grid.wgsl.
     pub(crate) fn of(count: usize, size: usize) -> Self {
         Self::Of(spread(count.div_ceil(size.max(1))))
     }
@@ -113,14 +114,6 @@ impl Commands<'_> {
         bindings: &[Binding],
         groups: Groups,
     ) -> Result<(), GpuError> {
-        if bindings.len() != kernel.bindings.len() {
-            return Err(GpuError::Argument {
-                kernel: kernel.name,
-                argument: "arguments",
-                expected: kernel.bindings.len().to_string(),
-                got: bindings.len().to_string(),
-            });
-        }
         if let Groups::Of([x, y, z]) = groups
             && x.max(y).max(z) as usize > GROUPS_MAX
         {
@@ -128,6 +121,14 @@ impl Commands<'_> {
             return Err(GpuError::TooSmall { resource: "a dispatch, workgroups", needed, limit });
         }
         let pipeline = self.gpu.pipeline(kernel, constants)?;
+        if bindings.len() != pipeline.arguments {
+            return Err(GpuError::Argument {
+                kernel: kernel.name,
+                argument: "arguments",
+                expected: pipeline.arguments.to_string(),
+                got: bindings.len().to_string(),
+            });
+        }
         self.steps.push(Step::Run { pipeline, bindings: bindings.to_vec(), groups });
         Ok(())
     }

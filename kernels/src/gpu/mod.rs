@@ -1,14 +1,23 @@
 //! The kernels as WGSL compute shaders, on every adapter that wgpu supports (Vulkan, Metal,
 //! DX12, and WebGPU of a browser: `wait_web.rs`).
 //!
-//! Files have the stems and arguments of [`crate::cpu`]; results agree within the tolerances of
-//! tests/gpu. [`Gpu::open`] opens an adapter. After an error the caller can use the CPU kernels.
+//! Results agree with those of [`crate::cpu`] within the tolerances of tests/gpu. [`Gpu::open`] opens an adapter. After an error the caller can use the CPU kernels.
 //! WebGPU's default limits suffice: 8 storage buffers per stage, 256 threads and 16 KiB per
 //! workgroup, 128 MiB per binding.
 //!
-//! Kernel x consists of `kernels/x.wgsl`, a [`Kernel`] and a method of [`Gpu`] in `x.rs`, and a
-//! CPU version of the same stem. tests/gpu/shaders.rs compares the WGSL source with
-//! [`crate::layout`] and with this table.
+//! A kernel consists of `wgsl/FAMILY/NAME.wgsl`, a [`Kernel`] and a method of [`Gpu`] or [`Array`]
+//! in `gpu/FAMILY`, and a CPU version, which the header of the WGSL file names. Constants and the
+//! uniform's struct of the WGSL come from Rust (`constants`, [`uniforms`]); the bind group
+//! layout comes from the declarations in the WGSL ([`Source::bindings`]). tests/gpu/shaders.rs checks
+//! every kernel with naga.
+//!
+//! | folder | content |
+//! |---|---|
+//! | `raster` | rasterizer, its gradients, drawing to a texture |
+//! | `spgr` | children of parents, opacity redistribution, their gradients |
+//! | `network` | attention gather, plane sweep, their gradients |
+//! | `array` | arrays in device memory and the network's other operations |
+//! | `uniforms` | parameters of the kernels |
 //!
 //! The table lists the stages of a frame of N splats with P (splat, tile) pairs on T tiles and px
 //! pixels. "Bytes" counts the reads and writes of the kernels without SH, gain and caches. "At
@@ -59,49 +68,40 @@
 
 mod adapter;
 mod array;
-mod attention_gather;
-mod attention_gather_bwd;
 mod buffers;
 mod commands;
+mod constants;
 mod device;
 mod error;
-mod frame;
-mod invert;
-mod layers;
+mod kernel;
+mod network;
 mod pipelines;
-mod plane_sweep;
-mod plane_sweep_bwd;
-mod raster_bwd;
-mod raster_kernels;
-mod rasterize;
-mod redistribute;
-mod scene;
-mod show;
-mod sort;
+mod raster;
 mod spgr;
-mod spgr_bwd;
+pub mod uniforms;
 #[cfg_attr(all(target_family = "wasm", target_os = "unknown"), path = "wait_web.rs")]
 mod wait;
 
 pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use array::{
-    ADAM_BLOCK, AdamCall, AdapterCall, AdapterView, AttentionCall, ConvolutionCall, CrossCheckCall,
-    DepthConsensusCall, DeviceArray, FULL_GRID, Function, HeadOutputCall, NormSum,
+    ADAM_BLOCK, AdamCall, AdapterCall, AdapterView, Array, AttentionCall, ConvolutionCall,
+    CrossCheckCall, DepthConsensusCall, FULL_GRID, Function, HeadOutputCall, NormSum,
     PointwiseFunction, RawMatchingCall, Recorder, Reduction, Work,
 };
-pub use attention_gather::AttentionGatherArgs;
-pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::{Buffer, ReadBacks};
 pub use device::{Gpu, features_of, limits_of};
 pub use error::GpuError;
-pub use pipelines::{Access, Kernel, Source};
-pub use plane_sweep::PlaneSweepArgs;
-pub use raster_bwd::Frame;
-pub use rasterize::Rasterizer;
-pub use redistribute::{RedistributeArgs, RedistributeGradients};
-pub use scene::{Scene, SceneArrays};
+pub use kernel::{Access, Kernel, Source};
+pub use network::attention_gather::AttentionGatherArgs;
+pub use network::attention_gather_bwd::AttentionGatherGradients;
+pub use network::plane_sweep::PlaneSweepArgs;
+pub use raster::constants::{FOOTPRINT_STRIDE, PAIR_SUMS, PLAN_WORDS};
+pub use raster::rasterize::Rasterizer;
+pub use raster::rasterize_bwd::Frame;
+pub use raster::scene::{Scene, SceneArrays};
 pub use spgr::SpgrArgs;
+pub use spgr::redistribute::{RedistributeArgs, RedistributeGradients};
 #[cfg(all(target_family = "wasm", target_os = "unknown"))]
 pub use wait::set_gpu_wait;
 /// The version of wgpu whose devices and textures [`Gpu`] uses.
@@ -109,38 +109,38 @@ pub use wgpu;
 
 /// All kernels of this module.
 pub const KERNELS: &[&Kernel] = &[
-    &raster_kernels::PROJECT,
-    &raster_kernels::SORT_COUNT,
-    &raster_kernels::SORT_SCATTER,
-    &raster_kernels::SCAN_REDUCE,
-    &raster_kernels::SCAN_WHOLE,
-    &raster_kernels::SCAN_APPLY,
-    &raster_kernels::PLAN,
-    &raster_kernels::PICK,
-    &raster_kernels::INTERSECT,
-    &raster_kernels::RANGES,
-    &raster_kernels::RASTERIZE,
-    &raster_kernels::RASTERIZE_BWD,
-    &raster_kernels::PAIR_SUMS,
-    &raster_kernels::PROJECT_BWD,
-    &raster_kernels::COLOUR_BWD,
-    &redistribute::REDISTRIBUTE,
-    &redistribute::REDISTRIBUTE_BWD,
-    &show::SHOW,
-    &attention_gather::ATTENTION_GATHER,
-    &plane_sweep::PLANE_SWEEP,
+    &raster::kernels::PROJECT,
+    &raster::kernels::SORT_COUNT,
+    &raster::kernels::SORT_SCATTER,
+    &raster::kernels::SCAN_REDUCE,
+    &raster::kernels::SCAN_WHOLE,
+    &raster::kernels::SCAN_APPLY,
+    &raster::kernels::PLAN,
+    &raster::kernels::PICK,
+    &raster::kernels::INTERSECT,
+    &raster::kernels::RANGES,
+    &raster::kernels::BLEND,
+    &raster::kernels::BLEND_BWD,
+    &raster::kernels::PAIR_SUMS,
+    &raster::kernels::PROJECT_BWD,
+    &raster::kernels::COLOUR_BWD,
+    &spgr::redistribute::REDISTRIBUTE,
+    &spgr::redistribute::REDISTRIBUTE_BWD,
+    &raster::show::SHOW,
+    &network::attention_gather::ATTENTION_GATHER,
+    &network::plane_sweep::PLANE_SWEEP,
     &spgr::SPGR,
-    &spgr_bwd::SPGR_BWD,
-    &spgr_bwd::SPGR_GAINS_BWD,
-    &invert::COUNT,
-    &invert::SCAN,
-    &invert::FILL,
-    &invert::ORDER,
-    &attention_gather_bwd::ATTENTION_GATHER_BWD,
-    &attention_gather_bwd::ATTENTION_GATHER_SCATTER,
-    &plane_sweep_bwd::PLANE_SWEEP_TAPS,
-    &plane_sweep_bwd::PLANE_SWEEP_REFERENCE_BWD,
-    &plane_sweep_bwd::PLANE_SWEEP_SOURCE_BWD,
+    &spgr::backward::SPGR_BWD,
+    &spgr::backward::SPGR_GAINS_BWD,
+    &network::COUNT,
+    &network::SCAN,
+    &network::FILL,
+    &network::ORDER,
+    &network::attention_gather_bwd::ATTENTION_GATHER_BWD,
+    &network::attention_gather_bwd::ATTENTION_GATHER_SCATTER,
+    &network::plane_sweep_bwd::PLANE_SWEEP_TAPS,
+    &network::plane_sweep_bwd::PLANE_SWEEP_REFERENCE_BWD,
+    &network::plane_sweep_bwd::PLANE_SWEEP_SOURCE_BWD,
     &array::ADAM,
     &array::ADAPTER,
     &array::ADAPTER_COLOURS,

@@ -1,81 +1,10 @@
-//! Kernels: WGSL source, arguments, and compiled pipelines, built once per device.
-//!
-//! The source of a kernel is the concatenation of files under `kernels/`: shared files
-//! (`kernels/shared`) first, then its own file. There is no preprocessor. Binding i of group 0 is
-//! argument i.
-//!
-//! A kernel that reduces over a workgroup has two sources, which differ in one shared file: with subgroup
-//! operations for devices that have them, and without for all others ([`Source`]).
+//! Compiled pipelines of the kernels, built once per device.
 
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
+use crate::gpu::kernel::{Access, Kernel};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
-
-/// Concatenates files under `kernels/` to a [`Source`]. `[a | b]` is file a without subgroups, b with them.
-macro_rules! wgsl {
-    ($($file:literal),+ $(,)?) => {
-        $crate::gpu::pipelines::Source { plain: wgsl!(@joined $($file),+), subgroups: None }
-    };
-    ($($file:literal),+ , [$plain:literal | $subgroups:literal], $($last:literal),+ $(,)?) => {
-        $crate::gpu::pipelines::Source {
-            plain: wgsl!(@joined $($file,)+ $plain, $($last),+),
-            subgroups: Some(wgsl!(@joined $($file,)+ $subgroups, $($last),+)),
-        }
-    };
-    (@joined $($file:literal),+) => {
-        concat!($(include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/", $file, ".wgsl"))),+)
-    };
-}
-pub(crate) use wgsl;
-
-/// WGSL source of a kernel, shared files included.
-#[derive(Clone, Copy, Debug)]
-pub struct Source {
-    /// Source without subgroup operations.
-    pub plain: &'static str,
-    /// Source with subgroup operations, for kernels that use them.
-    pub subgroups: Option<&'static str>,
-}
-
-impl Source {
-    /// Returns the source for devices with or without subgroup operations.
-    pub fn of(&self, subgroups: bool) -> &'static str {
-        self.subgroups.filter(|_| subgroups).unwrap_or(self.plain)
-    }
-}
-
-/// Access of a kernel to an argument.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Access {
-    /// `var<uniform>`.
-    Uniform,
-    /// `var<storage, read>`.
-    Read,
-    /// `var<storage, read_write>`.
-    Write,
-}
-
-/// One entry point of one file under `kernels/`.
-#[derive(Debug)]
-pub struct Kernel {
-    /// Stem of the kernel's file.
-    pub name: &'static str,
-    /// Entry point.
-    pub entry: &'static str,
-    /// WGSL source.
-    pub source: Source,
-    /// Arguments in the order of their bindings. At most 8 are storage buffers (WebGPU's default
-    /// limit).
-    pub bindings: &'static [Access],
-}
-
-impl Kernel {
-    /// Returns name and entry point.
-    pub(crate) fn label(&self) -> String {
-        format!("{}::{}", self.name, self.entry)
-    }
-}
 
 /// Values of the kernel's `override` constants.
 pub(crate) type Constants<'a> = &'a [(&'static str, f64)];
@@ -85,6 +14,8 @@ pub(crate) struct Pipeline {
     pub(crate) raw: wgpu::ComputePipeline,
     pub(crate) layout: wgpu::BindGroupLayout,
     pub(crate) label: String,
+    /// Number of arguments.
+    pub(crate) arguments: usize,
 }
 
 /// Kernel, entry point, and the bits of its constants.
@@ -123,9 +54,10 @@ impl Gpu {
 
     /// Returns the compiled module of a kernel's file. Errors go to the open error scope.
     pub(crate) fn module(&self, kernel: &'static Kernel) -> wgpu::ShaderModule {
-        let (name, source) = (kernel.name, kernel.source.of(self.has_subgroups()));
+        let name = kernel.name;
         let mut modules = self.pipelines.modules.lock().unwrap_or_else(PoisonError::into_inner);
         let compile = || {
+            let source = kernel.source.text(self.has_subgroups());
             self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(name),
                 source: wgpu::ShaderSource::Wgsl(source.into()),
@@ -137,7 +69,8 @@ impl Gpu {
     fn build(&self, kernel: &'static Kernel, constants: Constants) -> Pipeline {
         let label = kernel.label();
         let module = self.module(kernel);
-        let layout = layout(&self.device, kernel, wgpu::ShaderStages::COMPUTE);
+        let bindings = kernel.source.bindings(self.has_subgroups());
+        let layout = layout(&self.device, &label, &bindings, wgpu::ShaderStages::COMPUTE);
         let whole = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
             label: Some(&label),
             bind_group_layouts: &[Some(&layout)],
@@ -155,20 +88,21 @@ impl Gpu {
             },
             cache: None,
         });
-        Pipeline { raw, layout, label }
+        Pipeline { raw, layout, label, arguments: bindings.len() }
     }
 }
 
-/// Returns the bind group layout of a kernel's arguments.
+/// Returns the bind group layout of a kernel's arguments ([`crate::gpu::Source::bindings`]).
 pub(crate) fn layout(
     device: &wgpu::Device,
-    kernel: &Kernel,
+    label: &str,
+    bindings: &[(u32, Access)],
     visibility: wgpu::ShaderStages,
 ) -> wgpu::BindGroupLayout {
-    let entry = |(i, &access)| entry(i, access, visibility);
-    let entries: Vec<_> = (0..).zip(kernel.bindings).map(entry).collect();
+    let entries: Vec<_> =
+        bindings.iter().map(|&(binding, access)| entry(binding, access, visibility)).collect();
     device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-        label: Some(&kernel.label()),
+        label: Some(label),
         entries: &entries,
     })
 }

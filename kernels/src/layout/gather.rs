@@ -103,8 +103,3 @@ impl Gather {
         self.levels.iter().map(|l| self.views * l.height * l.width).sum()
     }
 }
-
-/// Largest number of samples per parent, V·L·M, in the GPU's kernel.
-pub const GATHER_SAMPLES_MAX: usize = 128;
-/// Largest number of samples × groups per parent in the GPU's kernel.
-pub const GATHER_WEIGHTS_MAX: usize = 1024;

@@ -1,9 +1,9 @@
 //! The data layout that the CPU kernels, the GPU kernels and the custom ops share: strides
 //! and offsets of packed rows, the constants of both rasterizer conventions, the options of
-//! a rasterizer call, and the uniforms of the WGSL kernels. Imports `camera` alone.
+//! a rasterizer call. Imports `camera` alone.
 //!
-//! Every constant of a kernel is defined here and nowhere else. `kernels/shared/abi.wgsl`
-//! repeats them for the GPU; `tests/gpu/shaders.rs` compares the two.
+//! Every constant that CPU and GPU kernels share is defined here and nowhere else. The WGSL of the
+//! GPU kernels takes its constants from here (gpu/constants.rs).
 
 mod frame;
 mod gather;
@@ -11,26 +11,17 @@ mod positions;
 pub mod random;
 mod spgr;
 mod sweep;
-mod uniforms;
 mod view;
 
 pub(crate) use frame::floats_at;
 pub use frame::{BlendRules, Geometry, Gradients, Rendered, SplatSlices};
-pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level, SampleConvention};
+pub use gather::{Drop, Gather, Level, SampleConvention};
 pub use positions::Positions;
 pub use spgr::{
     AMinMode, AreaAt, CHILDREN_MAX, DISC_AREA_SQ_MIN, DepthDir, DepthUnit, GainSpace, PrimaryView,
-    Rules, SPGR_CAMERA_STRIDE, Slide,
+    Rules, Slide,
 };
-pub use sweep::{Pair, SWEEP_PAIR_STRIDE, Sweep};
-pub use uniforms::{
-    AdamUniform, AdapterUniform, AttentionGatherUniform, AttentionUniform, AttributesUniform,
-    ConvexUniform, ConvolutionUniform, CrossCheckUniform, DepthConsensusUniform,
-    ElementwiseUniform, ExpectationUniform, HeadOutputUniform, InvertUniform, LinearUniform,
-    LinearWeightBwdUniform, NormUniform, OcclusionUniform, PlaneSweepUniform, RasterUniform,
-    RawMatchingUniform, RedistributeUniform, ReduceUniform, ResizeUniform, RowsUniform,
-    SelectUniform, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform, SumPartsUniform,
-};
+pub use sweep::{Pair, Sweep};
 pub use view::View;
 
 use serde::{Deserialize, Serialize};
@@ -90,25 +81,6 @@ pub const SPAN_SLACK_PX: f32 = 1e-3;
 /// Largest opacity that is used, far beyond any cap on alpha: its logarithm fits the
 /// exponential's range.
 pub const OPACITY_MAX: f32 = 1e36;
-/// Side of the tiles of the GPU kernels, px: one thread per pixel.
-pub const TILE_GPU: usize = 16;
-/// Floats of a projected splat in the GPU kernels (kernels/shared/raster.wgsl).
-pub const FOOTPRINT_STRIDE: usize = 12;
-/// Sums over pixels per (splat, tile) pair in the rasterizer's backward kernels: of
-/// ∂L/∂ln α times six moments, and of weights times four gradients.
-pub const PAIR_SUMS: usize = 10;
-/// Elements per workgroup of the GPU's sort and prefix sum.
-pub const GPU_BLOCK: usize = 2048;
-/// Offset in the plan of a sort: number of elements.
-pub const PLAN_COUNT: usize = 3;
-/// Offset in the plan: number of blocks of [`GPU_BLOCK`] elements.
-pub const PLAN_BLOCKS: usize = 4;
-/// Offset in the plan: number of elements that the buffers would need.
-pub const PLAN_REQUESTED: usize = 5;
-/// Offset in the plan: workgroups of 256 elements along x, y and z. Those of blocks are at 0.
-pub const PLAN_ELEMENT_GROUPS: usize = 8;
-/// Words of a plan.
-pub const PLAN_WORDS: usize = 12;
 /// Side of the tiles of the CPU kernels, px. It has no effect on the picture.
 pub const TILE: usize = 32;
 /// Side of the pixel blocks of a tile, px: 4 × 4 pixels fill a register of 16 lanes.
@@ -263,9 +235,6 @@ pub enum MuInput {
     /// x/z, y/z, ln z.
     RayLogz,
 }
-
-/// Index of no cell, in the inverted lists by which gradients are summed.
-pub const NONE: u32 = u32::MAX;
 
 /// ε of w̃ = w / (A + ε), px² (supp. A.3).
 pub const AREA_EPS: f64 = 1e-8;

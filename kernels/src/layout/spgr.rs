@@ -137,7 +137,5 @@ impl Rules {
     }
 }
 
-/// Floats of a context camera in the GPU's table.
-pub const SPGR_CAMERA_STRIDE: usize = 23;
 /// Smallest squared area of a disc along which children move, px⁴.
 pub const DISC_AREA_SQ_MIN: f64 = 1e-20;

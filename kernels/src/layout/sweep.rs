@@ -43,6 +43,3 @@ impl Sweep {
         self.depths.first().map_or(0, Vec::len)
     }
 }
-
-/// Floats of one [`Pair`] in the GPU's table: inverse, rotation, t, k.
-pub const SWEEP_PAIR_STRIDE: usize = 20;

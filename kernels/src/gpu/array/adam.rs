@@ -1,34 +1,24 @@
 //! Adam on all parameters at once.
 //!
-//! CPU version: [`crate::cpu::adam`]. WGSL: kernels/adam.wgsl. Tests: tests/gpu/optimizer.rs.
+//! CPU version: [`crate::cpu::adam`]. WGSL: wgsl/network/adam.wgsl. Tests: tests/gpu/optimizer.rs.
 
-use super::DeviceArray;
+use super::Array;
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::AdamUniform;
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::AdamUniform;
 
 pub(crate) static ADAM: Kernel = Kernel {
     name: "adam",
     entry: "main",
-    source: wgsl!("shared/grid", "adam"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-        Access::Write,
-        Access::Write,
-        Access::Write,
-    ],
+    source: wgsl!(AdamUniform; "shared/grid", "network/adam"),
 };
 
 /// Elements of a block, which belong to one parameter; so many threads a workgroup has.
 pub const ADAM_BLOCK: usize = 64;
 
-/// Constants of [`DeviceArray::adam`].
+/// Constants of [`Array::adam`].
 #[derive(Clone, Copy, Debug)]
 pub struct AdamCall<'a> {
     /// Factor of the gradients.
@@ -46,7 +36,7 @@ pub struct AdamCall<'a> {
     pub parameters: &'a [[f32; 4]],
 }
 
-impl DeviceArray {
+impl Array {
     /// Takes a step with gradients `self`: `state` are values, first and second moments and moving
     /// averages, all of the same length, and change in place.
     ///

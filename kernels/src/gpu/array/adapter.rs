@@ -1,34 +1,28 @@
 //! Primaries in world frame from raw head rows (MVSplat's Gaussian adapter).
 //!
-//! CPU version: kernels/src/cpu/adapter. WGSL: kernels/adapter.wgsl, adapter_colours.wgsl. Oracle and tests:
+//! CPU version: cpu/adapter. WGSL: wgsl/network/adapter.wgsl, adapter_colours.wgsl. Oracle and tests:
 //! tests/gpu/primaries.rs.
 
-use super::{DeviceArray, misfit};
+use super::{Array, misfit};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{AdapterUniform, SPLAT_STRIDE};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::AdapterUniform;
+use crate::layout::SPLAT_STRIDE;
 
 pub(crate) static ADAPTER: Kernel = Kernel {
     name: "adapter",
     entry: "main",
-    source: wgsl!("shared/abi", "shared/grid", "shared/activation", "shared/adapter", "adapter"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
+    source: wgsl!(
+        AdapterUniform; "shared/grid", "shared/activation", "network/adapter"
+    ),
 };
 
 pub(crate) static ADAPTER_COLOURS: Kernel = Kernel {
     name: "adapter_colours",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/adapter", "adapter_colours"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(AdapterUniform; "shared/grid", "network/adapter_colours"),
 };
 
 const THREADS: usize = 64;
@@ -48,7 +42,7 @@ pub struct AdapterView {
     pub quat: [[f32; 4]; 4],
 }
 
-/// Constants of [`DeviceArray::placed`] and [`DeviceArray::placed_colours`].
+/// Constants of [`Array::placed`] and [`Array::placed_colours`].
 #[derive(Clone, Copy, Debug)]
 pub struct AdapterCall {
     /// Views.
@@ -83,7 +77,7 @@ impl AdapterCall {
     }
 
     /// Refuses raw rows of another number of elements.
-    fn check(&self, kernel: &'static str, raw: &DeviceArray) -> Result<(), GpuError> {
+    fn check(&self, kernel: &'static str, raw: &Array) -> Result<(), GpuError> {
         let row = GEOMETRY + 3 * self.functions;
         match raw.count() == self.pixels() * row && self.pixels() > 0 && self.per_pixel > 0 {
             true => Ok(()),
@@ -95,7 +89,7 @@ impl AdapterCall {
     }
 }
 
-impl DeviceArray {
+impl Array {
     /// Computes the packed rows `[N, 11]` of raw rows `[views·H·W, 9 + 3·D]`, `depths` and `densities`
     /// `[views·H·W, G]`; N is views·H·W·G.
     ///
@@ -140,7 +134,7 @@ impl DeviceArray {
     /// `matrices` `[views, D, D]` map raw SH of each view.
     ///
     /// # Errors
-    /// As [`DeviceArray::placed`].
+    /// As [`Array::placed`].
     pub fn placed_colours(
         &self,
         matrices: &[f32],

@@ -1,26 +1,18 @@
 //! Attention without a matrix of logits.
 //!
-//! WGSL: kernels/attention.wgsl.
+//! WGSL: wgsl/network/attention.wgsl.
 
-use super::{DeviceArray, Function, PointwiseFunction, misfit};
+use super::{Array, Function, PointwiseFunction, misfit};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::AttentionUniform;
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::AttentionUniform;
 
 pub(crate) static ATTENTION: Kernel = Kernel {
     name: "attention",
     entry: "main",
-    source: wgsl!("shared/grid", "attention"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
+    source: wgsl!(AttentionUniform; "shared/grid", "network/attention"),
 };
 
 /// Queries of a workgroup.
@@ -53,7 +45,7 @@ impl AttentionCall<'_> {
     }
 }
 
-impl DeviceArray {
+impl Array {
     /// Computes attention of queries `[R, L, d]` to `k` `[R, M, d]` and `v` `[R, M, e]`, e at most
     /// 256: `[R, L, e]`.
     ///
@@ -99,11 +91,11 @@ impl DeviceArray {
     }
 
     /// Computes the gradients of queries, this array, keys and values from the gradient `dy`
-    /// `[R, L, e]` of [`DeviceArray::attention`], row by row: one matrix `[L, M]` of weights exists
+    /// `[R, L, e]` of [`Array::attention`], row by row: one matrix `[L, M]` of weights exists
     /// at a time.
     ///
     /// # Errors
-    /// As [`DeviceArray::attention`].
+    /// As [`Array::attention`].
     pub fn attention_backward(
         &self,
         k: &Self,

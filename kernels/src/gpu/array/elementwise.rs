@@ -1,25 +1,24 @@
 //! Functions of one or two arrays, element by element, and copies in another order.
 //!
-//! WGSL: kernels/elementwise.wgsl.
+//! WGSL: wgsl/network/elementwise.wgsl.
 
-use super::{ALIGNMENT, DeviceArray, misfit};
+use super::{ALIGNMENT, Array, misfit};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::ElementwiseUniform;
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::ElementwiseUniform;
 
 pub(crate) static ELEMENTWISE: Kernel = Kernel {
     name: "elementwise",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/activation", "elementwise"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(ElementwiseUniform; "shared/grid", "shared/activation", "network/elementwise"),
 };
 
 const THREADS: usize = 64;
 /// Axes of the kernel.
 const AXES: usize = 7;
 
-/// An activation function, numbered as in kernels/shared/activation.wgsl.
+/// An activation function, numbered as in wgsl/shared/activation.wgsl.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PointwiseFunction {
     /// x.
@@ -34,7 +33,7 @@ pub enum PointwiseFunction {
     Sigmoid = 4,
 }
 
-/// A function of kernels/elementwise.wgsl.
+/// A function of wgsl/network/elementwise.wgsl.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Function {
     /// x.
@@ -205,9 +204,9 @@ struct Call<'a> {
     function: Function,
     after: PointwiseFunction,
     sizes: &'a [usize],
-    left: (&'a DeviceArray, Walk),
-    right: (&'a DeviceArray, Walk),
-    result: (&'a DeviceArray, Walk),
+    left: (&'a Array, Walk),
+    right: (&'a Array, Walk),
+    result: (&'a Array, Walk),
 }
 
 impl Call<'_> {
@@ -242,8 +241,7 @@ impl Call<'_> {
             ("ACTIVATION_KIND", kind),
             ("AFTER_KIND", f64::from(self.after as u32)),
         ];
-        let [left, right, result] =
-            [self.left.0, self.right.0, self.result.0].map(DeviceArray::binding);
+        let [left, right, result] = [self.left.0, self.right.0, self.result.0].map(Array::binding);
         // A second operand that is not read is no traffic.
         let right = if self.function.has_right() { right } else { self.right.0.first_binding() };
         let call = (self.function.name(), &ELEMENTWISE);
@@ -252,7 +250,7 @@ impl Call<'_> {
     }
 }
 
-impl DeviceArray {
+impl Array {
     /// Computes `function` of every element.
     ///
     /// # Errors
@@ -285,10 +283,10 @@ impl DeviceArray {
         self.with_then(other, function, PointwiseFunction::None)
     }
 
-    /// [`DeviceArray::with`], then an activation function, in one call.
+    /// [`Array::with`], then an activation function, in one call.
     ///
     /// # Errors
-    /// As [`DeviceArray::with`].
+    /// As [`Array::with`].
     pub fn with_then(
         &self,
         other: &Self,

@@ -3,7 +3,7 @@
 //! An operation allocates its result and records the call of a kernel. [`Recorder`] submits calls
 //! in groups; a buffer returns to the pool after the submit of the last call that reads it, so
 //! that the memory in use is that of the arrays alive and of one group. Arrays are contiguous;
-//! [`DeviceArray::reshape`] and whole leading parts share memory.
+//! [`Array::reshape`] and whole leading parts share memory.
 //!
 //! Gradients (`*_backward`) are operations too; `subsplat::network::ops::TapeArray` has the tape that calls them.
 //!
@@ -89,7 +89,8 @@ use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::{Commands, Groups, Pending};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Constants, Kernel};
+use crate::gpu::kernel::Kernel;
+use crate::gpu::pipelines::Constants;
 use bytemuck::Pod;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -158,25 +159,21 @@ impl Recorder {
     ///
     /// # Errors
     /// [`GpuError::Argument`] for another number of values; errors of the device.
-    pub fn upload(
-        self: &Arc<Self>,
-        values: &[f32],
-        dims: &[usize],
-    ) -> Result<DeviceArray, GpuError> {
+    pub fn upload(self: &Arc<Self>, values: &[f32], dims: &[usize]) -> Result<Array, GpuError> {
         let lengths = [("values", values.len(), dims.iter().product())];
         GpuError::check_lengths(NAME, lengths)?;
         let buffer = self.gpu.upload(NAME, values)?;
-        Ok(DeviceArray { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
+        Ok(Array { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
     }
 
     /// Allocates an array whose elements the next call writes.
-    pub(super) fn empty(self: &Arc<Self>, dims: &[usize]) -> Result<DeviceArray, GpuError> {
+    pub(super) fn empty(self: &Arc<Self>, dims: &[usize]) -> Result<Array, GpuError> {
         let buffer = self.gpu.empty::<f32>(NAME, dims.iter().product())?;
-        Ok(DeviceArray { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
+        Ok(Array { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
     }
 
     /// Allocates an array of zeros.
-    pub(super) fn zeros(self: &Arc<Self>, dims: &[usize]) -> Result<DeviceArray, GpuError> {
+    pub(super) fn zeros(self: &Arc<Self>, dims: &[usize]) -> Result<Array, GpuError> {
         let array = self.empty(dims)?;
         self.record(array.buffer.bytes(), |commands| {
             commands.clear(&array.buffer);
@@ -295,8 +292,8 @@ impl Recorder {
     ///
     /// # Errors
     /// Errors of the device.
-    pub fn read(&self, arrays: &[&DeviceArray]) -> Result<Vec<Vec<f32>>, GpuError> {
-        let aligned = |array: &&DeviceArray| match array.offset {
+    pub fn read(&self, arrays: &[&Array]) -> Result<Vec<Vec<f32>>, GpuError> {
+        let aligned = |array: &&Array| match array.offset {
             0 => Ok((*array).clone()),
             _ => array.copied(),
         };
@@ -316,7 +313,7 @@ impl Recorder {
 
 /// An f32 array in device memory, row-major. Clones share the memory; operations make new arrays.
 #[derive(Clone)]
-pub struct DeviceArray {
+pub struct Array {
     recorder: Arc<Recorder>,
     buffer: Buffer,
     /// First element; a multiple of [`ALIGNMENT`].
@@ -324,16 +321,16 @@ pub struct DeviceArray {
     dims: Vec<usize>,
 }
 
-impl fmt::Debug for DeviceArray {
+impl fmt::Debug for Array {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.debug_struct("DeviceArray").field("dims", &self.dims).finish_non_exhaustive()
+        f.debug_struct("Array").field("dims", &self.dims).finish_non_exhaustive()
     }
 }
 
 /// Alignment of a binding, floats (WebGPU: 256 bytes).
 const ALIGNMENT: usize = 64;
 
-impl DeviceArray {
+impl Array {
     /// Returns the dimensions.
     pub fn dims(&self) -> &[usize] {
         &self.dims
@@ -404,7 +401,7 @@ impl DeviceArray {
 fn check_residual(
     kernel: &'static str,
     dims: &[usize],
-    residual: Option<&DeviceArray>,
+    residual: Option<&Array>,
 ) -> Result<(), GpuError> {
     match residual.filter(|residual| residual.dims != dims) {
         Some(other) => Err(misfit(kernel, format!("a residual of {dims:?}"), &other.dims)),

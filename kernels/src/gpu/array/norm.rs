@@ -1,84 +1,57 @@
 //! Normalisation over groups of channels and over the last axis.
 //!
-//! WGSL: kernels/norm_statistics.wgsl, kernels/norm_apply.wgsl, kernels/layer_norm.wgsl.
+//! WGSL: wgsl/network/norm_statistics.wgsl, wgsl/network/norm_apply.wgsl, wgsl/network/layer_norm.wgsl.
 
-use super::{DeviceArray, PointwiseFunction, check_residual, misfit};
+use super::{Array, PointwiseFunction, check_residual, misfit};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{NormUniform, RowsUniform};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{NormUniform, RowsUniform};
 
 pub(crate) static NORM_STATISTICS: Kernel = Kernel {
     name: "norm_statistics",
     entry: "main",
     source: wgsl!(
-        "shared/grid",
-        "shared/norm",
-        "shared/sum",
-        ["shared/place" | "shared/place_subgroups"],
-        "norm_statistics"
+        NormUniform; "shared/grid", "shared/norm", "shared/sum",
+        ["shared/place" | "shared/place_subgroups"], "network/norm_statistics"
     ),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 
 pub(crate) static NORM_APPLY: Kernel = Kernel {
     name: "norm_apply",
     entry: "main",
     source: wgsl!(
-        "shared/grid",
-        "shared/activation",
-        "shared/norm",
-        "shared/norm_read",
-        "norm_apply"
+        NormUniform; "shared/grid", "shared/activation", "shared/norm", "shared/norm_read",
+        "network/norm_apply"
     ),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
 };
 
 pub(crate) static LAYER_NORM: Kernel = Kernel {
     name: "layer_norm",
     entry: "main",
     source: wgsl!(
-        "shared/grid",
-        "shared/rows",
-        "shared/sum",
-        ["shared/place" | "shared/place_subgroups"],
-        "layer_norm"
+        RowsUniform; "shared/grid", "shared/rows", "shared/sum",
+        ["shared/place" | "shared/place_subgroups"], "network/layer_norm"
     ),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
 };
 
 /// ε of every normalisation (PyTorch's default).
 pub(super) const EPSILON: f32 = 1e-5;
-/// Numbers of a part of a row (kernels/shared/norm.wgsl).
+/// Numbers of a part of a row (wgsl/shared/norm.wgsl).
 pub(super) const PART: usize = 8192;
 
-/// Array of the same sizes that [`DeviceArray::layer_norm`] adds.
+/// Array of the same sizes that [`Array::layer_norm`] adds.
 #[derive(Clone, Copy, Debug)]
 pub enum NormSum<'a> {
     /// None.
     None,
     /// The sum is normalised.
-    Before(&'a DeviceArray),
+    Before(&'a Array),
     /// The norm's result is added to it.
-    After(&'a DeviceArray),
+    After(&'a Array),
 }
 
-impl DeviceArray {
+impl Array {
     /// Normalises groups of channels of `[B, C, …]`, multiplies and adds `affine`, `[C]` each,
     /// applies `activation`, and adds `residual` of the same sizes.
     ///
@@ -122,7 +95,7 @@ impl DeviceArray {
         let workgroups = || Groups::of(rows * parts, 1);
         let bindings = [self.binding(), statistics.binding()];
         self.recorder.call(&NORM_STATISTICS, &[], &uniform, &bindings, workgroups())?;
-        let [factors, summands] = affine.unwrap_or([self, self]).map(DeviceArray::binding);
+        let [factors, summands] = affine.unwrap_or([self, self]).map(Array::binding);
         let (has_residual, residual) = self.residual_argument(residual);
         let bindings =
             [self.binding(), statistics.binding(), factors, summands, residual, result.binding()];
@@ -151,7 +124,7 @@ impl DeviceArray {
         let result = self.recorder.empty(&self.dims)?;
         let uniform =
             RowsUniform { rows: rows as u32, length: length as u32, epsilon: EPSILON, pad: 0 };
-        let [factors, summands] = affine.map(DeviceArray::binding);
+        let [factors, summands] = affine.map(Array::binding);
         let other = other.map_or_else(|| self.first_binding(), Self::binding);
         let bindings = [self.binding(), factors, summands, other, result.binding()];
         let constants = [("SUM", f64::from(place))];

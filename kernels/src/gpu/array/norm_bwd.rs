@@ -1,85 +1,46 @@
 //! Gradients of the normalisations.
 //!
-//! CPU version: [`crate::cpu::norm`]. WGSL: kernels/norm_sums_bwd.wgsl, kernels/norm_bwd.wgsl,
-//! kernels/layer_norm_bwd.wgsl. Tests: tests/gpu/array_gradients.rs.
+//! CPU version: [`crate::cpu::norm`]. WGSL: wgsl/network/norm_sums_bwd.wgsl, wgsl/network/norm_bwd.wgsl,
+//! wgsl/network/layer_norm_bwd.wgsl. Tests: tests/gpu/array_gradients.rs.
 
 use super::norm::{EPSILON, NORM_STATISTICS, PART};
-use super::{DeviceArray, PointwiseFunction, misfit};
+use super::{Array, PointwiseFunction, misfit};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{NormUniform, RowsUniform};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{NormUniform, RowsUniform};
 
 pub(crate) static NORM_SUMS_BWD: Kernel = Kernel {
     name: "norm_sums_bwd",
     entry: "main",
     source: wgsl!(
-        "shared/grid",
-        "shared/activation",
-        "shared/norm",
-        "shared/norm_read",
-        "shared/norm_channel",
-        "shared/sum",
-        ["shared/place" | "shared/place_subgroups"],
-        "norm_sums_bwd"
+        NormUniform; "shared/grid", "shared/activation", "shared/norm", "shared/norm_read",
+        "shared/norm_channel", "shared/sum", ["shared/place" | "shared/place_subgroups"],
+        "network/norm_sums_bwd"
     ),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
 };
 
 pub(crate) static NORM_BWD: Kernel = Kernel {
     name: "norm_bwd",
     entry: "main",
     source: wgsl!(
-        "shared/grid",
-        "shared/activation",
-        "shared/norm",
-        "shared/norm_read",
-        "shared/norm_channel",
-        "norm_bwd"
+        NormUniform; "shared/grid", "shared/activation", "shared/norm", "shared/norm_read",
+        "shared/norm_channel", "network/norm_bwd"
     ),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
 };
 
 pub(crate) static LAYER_NORM_BWD: Kernel = Kernel {
     name: "layer_norm_bwd",
     entry: "main",
     source: wgsl!(
-        "shared/grid",
-        "shared/rows",
-        "shared/sum",
-        ["shared/place" | "shared/place_subgroups"],
-        "layer_norm_bwd"
+        RowsUniform; "shared/grid", "shared/rows", "shared/sum",
+        ["shared/place" | "shared/place_subgroups"], "network/layer_norm_bwd"
     ),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-        Access::Write,
-    ],
 };
 
-impl DeviceArray {
+impl Array {
     /// Computes the gradients of the array, of the factors and of the summands of
-    /// [`DeviceArray::group_norm`] from the gradient `dy` of the result. Without `affine` the last
+    /// [`Array::group_norm`] from the gradient `dy` of the result. Without `affine` the last
     /// two are those of factors 1 and summands 0.
     ///
     /// # Errors
@@ -121,7 +82,7 @@ impl DeviceArray {
         let workgroups = Groups::of(rows * parts, 1);
         self.recorder.call(&NORM_STATISTICS, &[], &uniform, &bindings, workgroups)?;
         let sums = self.recorder.empty(&[b * c, channel_parts, 2])?;
-        let [factors, summands] = affine.unwrap_or([self, self]).map(DeviceArray::binding);
+        let [factors, summands] = affine.unwrap_or([self, self]).map(Array::binding);
         let all = [self.binding(), statistics.binding(), factors, summands, dy.binding()];
         let constants = [("ACTIVATION_KIND", f64::from(activation as u32))];
         let workgroups = || Groups::of(b * c * channel_parts, 1);
@@ -137,7 +98,7 @@ impl DeviceArray {
     }
 
     /// Computes the gradients of the array, of the factors and of the summands of
-    /// [`DeviceArray::layer_norm`] from the gradient `dy` of the result.
+    /// [`Array::layer_norm`] from the gradient `dy` of the result.
     ///
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.

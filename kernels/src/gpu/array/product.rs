@@ -1,25 +1,23 @@
 //! Convolution and linear layer.
 //!
-//! WGSL: kernels/convolution.wgsl, kernels/linear.wgsl.
+//! WGSL: wgsl/network/convolution.wgsl, wgsl/network/linear.wgsl.
 
-use super::{DeviceArray, PointwiseFunction, misfit};
+use super::{Array, PointwiseFunction, misfit};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{ConvolutionUniform, LinearUniform};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{ConvolutionUniform, LinearUniform};
 
 pub(crate) static CONVOLUTION: Kernel = Kernel {
     name: "convolution",
     entry: "main",
-    source: wgsl!("shared/activation", "shared/product", "convolution"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(ConvolutionUniform; "shared/activation", "shared/product", "network/convolution"),
 };
 
 pub(crate) static LINEAR: Kernel = Kernel {
     name: "linear",
     entry: "main",
-    source: wgsl!("shared/activation", "shared/grid", "shared/product", "linear"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(LinearUniform; "shared/activation", "shared/grid", "shared/product", "network/linear"),
 };
 
 /// Rows and columns of the result that a workgroup computes.
@@ -48,7 +46,7 @@ pub(super) fn words([a, b, c]: [usize; 3], last: usize) -> [u32; 4] {
     [a, b, c, last].map(|n| n as u32)
 }
 
-impl DeviceArray {
+impl Array {
     /// Convolves `[B, C, (D,) H, W]` with `weight` `[O, C, (kd,) kh, kw]`, then applies `activation`; `bias`
     /// `[O]`.
     ///

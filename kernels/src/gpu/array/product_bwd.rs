@@ -3,28 +3,26 @@
 //! The gradient of an input is the same operation with the transposed weight. The gradient of a
 //! weight is a matrix product over parts of the pixels or rows, whose results are added in order.
 //! CPU versions: [`crate::cpu::conv`], [`crate::cpu::gemm`]. WGSL:
-//! kernels/convolution_weight_bwd.wgsl, kernels/linear_weight_bwd.wgsl. Tests:
+//! wgsl/network/convolution_weight_bwd.wgsl, wgsl/network/linear_weight_bwd.wgsl. Tests:
 //! tests/gpu/array_gradients.rs.
 
 use super::product::{SIDE, volume, words};
-use super::{ConvolutionCall, DeviceArray, PointwiseFunction, misfit};
+use super::{Array, ConvolutionCall, PointwiseFunction, misfit};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{ConvolutionUniform, LinearWeightBwdUniform};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{ConvolutionUniform, LinearWeightBwdUniform};
 
 pub(crate) static CONVOLUTION_WEIGHT_BWD: Kernel = Kernel {
     name: "convolution_weight_bwd",
     entry: "main",
-    source: wgsl!("shared/product", "convolution_weight_bwd"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(ConvolutionUniform; "shared/product", "network/convolution_weight_bwd"),
 };
 
 pub(crate) static LINEAR_WEIGHT_BWD: Kernel = Kernel {
     name: "linear_weight_bwd",
     entry: "main",
-    source: wgsl!("shared/product", "linear_weight_bwd"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(LinearWeightBwdUniform; "shared/product", "network/linear_weight_bwd"),
 };
 
 /// Smallest number of pixels or rows of a part.
@@ -39,8 +37,8 @@ fn part_size(length: usize, floats: usize) -> usize {
     length.div_ceil(parts).max(PART_MIN)
 }
 
-impl DeviceArray {
-    /// Computes the gradient of the input of [`DeviceArray::convolved`] from that of the result,
+impl Array {
+    /// Computes the gradient of the input of [`Array::convolved`] from that of the result,
     /// this array; `dims` are the dimensions of the input.
     ///
     /// # Errors
@@ -86,7 +84,7 @@ impl DeviceArray {
         whole.convolved(&turned, None, call, PointwiseFunction::None)
     }
 
-    /// Computes the gradient of the weight of [`DeviceArray::convolved`], whose dimensions are
+    /// Computes the gradient of the weight of [`Array::convolved`], whose dimensions are
     /// `dims`, from the input, this array, and the gradient `dy` of the result.
     ///
     /// # Errors

@@ -1,46 +1,39 @@
 //! Reductions over an axis, softmax, and chosen indices.
 //!
-//! WGSL: kernels/reduce.wgsl, kernels/softmax.wgsl, kernels/select_rows.wgsl,
-//! kernels/resize.wgsl.
+//! WGSL: wgsl/network/reduce.wgsl, wgsl/network/softmax.wgsl, wgsl/network/select_rows.wgsl,
+//! wgsl/network/resize.wgsl.
 
-use super::{DeviceArray, PointwiseFunction, misfit};
+use super::{Array, PointwiseFunction, misfit};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{ReduceUniform, ResizeUniform, RowsUniform, SelectUniform};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{ReduceUniform, ResizeUniform, RowsUniform, SelectUniform};
 
 pub(crate) static REDUCE: Kernel = Kernel {
     name: "reduce",
     entry: "main",
-    source: wgsl!("shared/grid", "reduce"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(ReduceUniform; "shared/grid", "network/reduce"),
 };
 
 pub(crate) static SOFTMAX: Kernel = Kernel {
     name: "softmax",
     entry: "main",
     source: wgsl!(
-        "shared/grid",
-        "shared/rows",
-        "shared/sum",
-        ["shared/place" | "shared/place_subgroups"],
-        "softmax"
+        RowsUniform; "shared/grid", "shared/rows", "shared/sum",
+        ["shared/place" | "shared/place_subgroups"], "network/softmax"
     ),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 
 pub(crate) static SELECT_ROWS: Kernel = Kernel {
     name: "select_rows",
     entry: "main",
-    source: wgsl!("shared/grid", "select_rows"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(SelectUniform; "shared/grid", "network/select_rows"),
 };
 
 pub(crate) static RESIZE: Kernel = Kernel {
     name: "resize",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/activation", "shared/resize", "resize"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(ResizeUniform; "shared/grid", "shared/activation", "shared/resize", "network/resize"),
 };
 
 const THREADS: usize = 64;
@@ -56,7 +49,7 @@ pub enum Reduction {
     Maximum,
 }
 
-impl DeviceArray {
+impl Array {
     /// Reduces dimension `dim`, whose size becomes 1.
     ///
     /// # Errors

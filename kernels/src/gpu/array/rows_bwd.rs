@@ -1,41 +1,38 @@
 //! Sums in a fixed order, and gradients of resizes and of chosen indices.
 //!
 //! CPU versions: [`crate::cpu::sums`], [`crate::cpu::resize`], tensor operations. WGSL:
-//! kernels/sum_parts.wgsl, kernels/resize_bwd.wgsl, kernels/select_rows_bwd.wgsl. Tests:
+//! wgsl/network/sum_parts.wgsl, wgsl/network/resize_bwd.wgsl, wgsl/network/select_rows_bwd.wgsl. Tests:
 //! tests/gpu/array_gradients.rs.
 
-use super::{DeviceArray, Function, misfit};
+use super::{Array, Function, misfit};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{ResizeUniform, SelectUniform, SumPartsUniform};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{ResizeUniform, SelectUniform, SumPartsUniform};
 
 pub(crate) static SUM_PARTS: Kernel = Kernel {
     name: "sum_parts",
     entry: "main",
-    source: wgsl!("shared/grid", "sum_parts"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(SumPartsUniform; "shared/grid", "network/sum_parts"),
 };
 
 pub(crate) static RESIZE_BWD: Kernel = Kernel {
     name: "resize_bwd",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/resize", "resize_bwd"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(ResizeUniform; "shared/grid", "shared/resize", "network/resize_bwd"),
 };
 
 pub(crate) static SELECT_ROWS_BWD: Kernel = Kernel {
     name: "select_rows_bwd",
     entry: "main",
-    source: wgsl!("shared/grid", "select_rows_bwd"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(SelectUniform; "shared/grid", "network/select_rows_bwd"),
 };
 
 const THREADS: usize = 64;
 /// Elements that one thread adds.
 const TERMS: usize = 64;
 
-impl DeviceArray {
+impl Array {
     /// Sums over dimension `dim`, whose size becomes 1, in several passes. The order of the sum
     /// depends on the sizes alone.
     ///
@@ -176,7 +173,7 @@ impl DeviceArray {
         dy.with(&sum, Function::Minus)?.with(self, Function::Times)
     }
 
-    /// Computes the gradient of [`DeviceArray::repeated`] from that of the result, this array.
+    /// Computes the gradient of [`Array::repeated`] from that of the result, this array.
     ///
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
@@ -191,7 +188,7 @@ impl DeviceArray {
         blocks.sum_over(3)?.sum_over(1)?.reshape(&[b, c, h, w])
     }
 
-    /// Computes the gradient of [`DeviceArray::pooled`] of an array of sizes `dims` from that of
+    /// Computes the gradient of [`Array::pooled`] of an array of sizes `dims` from that of
     /// the result, this array.
     ///
     /// # Errors

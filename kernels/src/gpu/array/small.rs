@@ -1,14 +1,14 @@
 //! The small backbone's own parts.
 //!
-//! WGSL: kernels/expectation.wgsl, convex.wgsl, head_output.wgsl, cross_check.wgsl, depth_consensus.wgsl,
+//! WGSL: wgsl/network/expectation.wgsl, convex.wgsl, head_output.wgsl, cross_check.wgsl, depth_consensus.wgsl,
 //! raw_matching_blocks.wgsl, raw_matching_scores.wgsl.
 
-use super::{DeviceArray, Reduction, misfit};
+use super::{Array, Reduction, misfit};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{
     ConvexUniform, CrossCheckUniform, DepthConsensusUniform, ExpectationUniform, HeadOutputUniform,
     RawMatchingUniform,
 };
@@ -16,90 +16,52 @@ use crate::layout::{
 pub(crate) static EXPECTATION: Kernel = Kernel {
     name: "expectation",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/expectation", "expectation"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(ExpectationUniform; "shared/grid", "shared/expectation", "network/expectation"),
 };
 
 pub(crate) static CONVEX: Kernel = Kernel {
     name: "convex",
     entry: "main",
-    source: wgsl!("shared/grid", "convex"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
+    source: wgsl!(ConvexUniform; "shared/grid", "network/convex"),
 };
 
 pub(crate) static HEAD_OUTPUT: Kernel = Kernel {
     name: "head_output",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/activation", "head_output"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-        Access::Write,
-    ],
+    source: wgsl!(HeadOutputUniform; "shared/grid", "shared/activation", "network/head_output"),
 };
 
 pub(crate) static CROSS_CHECK: Kernel = Kernel {
     name: "cross_check",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/rgbd", "cross_check"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(CrossCheckUniform; "shared/grid", "shared/rgbd", "network/cross_check"),
 };
 
 pub(crate) static DEPTH_CONSENSUS: Kernel = Kernel {
     name: "depth_consensus",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/rgbd", "depth_consensus"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
+    source: wgsl!(DepthConsensusUniform; "shared/grid", "shared/rgbd", "network/depth_consensus"),
 };
 
 pub(crate) static RAW_MATCHING_BLOCKS: Kernel = Kernel {
     name: "raw_matching_blocks",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/raw_matching", "raw_matching_blocks"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-    ],
+    source: wgsl!(RawMatchingUniform; "shared/grid", "shared/raw_matching", "network/raw_matching_blocks"),
 };
 
 pub(crate) static RAW_MATCHING_SCORES: Kernel = Kernel {
     name: "raw_matching_scores",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/raw_matching", "raw_matching_scores"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(RawMatchingUniform; "shared/grid", "shared/raw_matching", "network/raw_matching_scores"),
 };
 
 const THREADS: usize = 64;
-/// Sums of a pixel and candidate, as in kernels/shared/raw_matching.wgsl.
+/// Sums of a pixel and candidate (wgsl/shared/raw_matching.wgsl).
 const PLANES: usize = 13;
 /// Channels of the result of a raw matching.
 const CHANNELS: usize = 4;
 
-/// Constants of [`DeviceArray::head_output`].
+/// Constants of [`Array::head_output`].
 #[derive(Clone, Copy, Debug)]
 pub struct HeadOutputCall<'a> {
     /// `[R]`: added to every row.
@@ -110,7 +72,7 @@ pub struct HeadOutputCall<'a> {
     pub confident: bool,
 }
 
-/// Constants of [`DeviceArray::cross_check`].
+/// Constants of [`Array::cross_check`].
 #[derive(Clone, Copy, Debug)]
 pub struct CrossCheckCall<'a> {
     /// Views of a scene.
@@ -126,7 +88,7 @@ pub struct CrossCheckCall<'a> {
     pub behind: f32,
 }
 
-/// Constants of [`DeviceArray::depth_consensus`].
+/// Constants of [`Array::depth_consensus`].
 #[derive(Clone, Copy, Debug)]
 pub struct DepthConsensusCall<'a> {
     /// Views of a scene.
@@ -149,7 +111,7 @@ pub struct DepthConsensusCall<'a> {
     pub steps: u32,
 }
 
-/// Constants of [`DeviceArray::raw_matching`].
+/// Constants of [`Array::raw_matching`].
 #[derive(Clone, Copy, Debug)]
 pub struct RawMatchingCall<'a> {
     /// Reference and source picture of each row.
@@ -165,7 +127,7 @@ pub struct RawMatchingCall<'a> {
     pub variance_floor: f32,
 }
 
-impl DeviceArray {
+impl Array {
     /// Computes expected candidate, then mass within `window` of the mode, of logits `[B, D, h, w]`:
     /// `[2, B, 1, h, w]`. `window_alone`: the mean is taken over the window.
     ///

@@ -1,49 +1,37 @@
 //! Gradients of the small backbone's own parts.
 //!
-//! CPU version: [`crate::cpu::small`]. WGSL: kernels/expectation_bwd.wgsl, kernels/convex_bwd.wgsl,
-//! kernels/convex_maps_bwd.wgsl. Tests: tests/gpu/array_gradients.rs.
+//! CPU version: [`crate::cpu::small`]. WGSL: wgsl/network/expectation_bwd.wgsl, wgsl/network/convex_bwd.wgsl,
+//! wgsl/network/convex_maps_bwd.wgsl. Tests: tests/gpu/array_gradients.rs.
 
-use super::{DeviceArray, misfit};
+use super::{Array, misfit};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
-use crate::layout::{ConvexUniform, ExpectationUniform};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::uniforms::{ConvexUniform, ExpectationUniform};
 
 pub(crate) static EXPECTATION_BWD: Kernel = Kernel {
     name: "expectation_bwd",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/expectation", "expectation_bwd"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(ExpectationUniform; "shared/grid", "shared/expectation", "network/expectation_bwd"),
 };
 
 pub(crate) static CONVEX_BWD: Kernel = Kernel {
     name: "convex_bwd",
     entry: "main",
-    source: wgsl!("shared/grid", "convex_bwd"),
-    bindings: &[
-        Access::Uniform,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Read,
-        Access::Write,
-        Access::Write,
-    ],
+    source: wgsl!(ConvexUniform; "shared/grid", "network/convex_bwd"),
 };
 
 pub(crate) static CONVEX_MAPS_BWD: Kernel = Kernel {
     name: "convex_maps_bwd",
     entry: "main",
-    source: wgsl!("shared/grid", "convex_maps_bwd"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(ConvexUniform; "shared/grid", "network/convex_maps_bwd"),
 };
 
 const THREADS: usize = 64;
 
-impl DeviceArray {
-    /// Computes the gradient of the logits of [`DeviceArray::expectation`], this array, from the
+impl Array {
+    /// Computes the gradient of the logits of [`Array::expectation`], this array, from the
     /// gradient `dy` `[2, B, 1, h, w]` of mean and mass.
     ///
     /// # Errors
@@ -76,7 +64,7 @@ impl DeviceArray {
         Ok(dx)
     }
 
-    /// Computes the gradients of the masks of [`DeviceArray::upsample_convex`], this array, and of
+    /// Computes the gradients of the masks of [`Array::upsample_convex`], this array, and of
     /// both maps from the gradient `dy` `[2, B, 1, 4h, 4w]` of the results.
     ///
     /// # Errors

@@ -1,34 +1,33 @@
 //! Parts of the trunk: attributes, visibility, attention gather, SPGR.
 //!
-//! WGSL: kernels/attributes.wgsl, kernels/occlusion.wgsl; attention gather and SPGR are those of
-//! [`crate::gpu::attention_gather`] and [`crate::gpu::spgr`].
+//! WGSL: wgsl/network/attributes.wgsl, wgsl/network/occlusion.wgsl; attention gather and SPGR are those of
+//! [`crate::gpu::network::attention_gather`] and [`crate::gpu::spgr`].
 
-use super::{DeviceArray, check_residual, misfit};
-use crate::gpu::attention_gather::{ATTENTION_GATHER, AttentionGatherArgs};
+use super::{Array, check_residual, misfit};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
+use crate::gpu::kernel::{Kernel, wgsl};
+use crate::gpu::network::attention_gather::{ATTENTION_GATHER, AttentionGatherArgs};
 use crate::gpu::spgr::{SPGR, SpgrArgs};
-use crate::layout::{AttributesUniform, Gather, OcclusionUniform, SPLAT_STRIDE};
+use crate::gpu::uniforms::{AttributesUniform, OcclusionUniform};
+use crate::layout::{Gather, SPLAT_STRIDE};
 
 pub(crate) static ATTRIBUTES: Kernel = Kernel {
     name: "attributes",
     entry: "main",
-    source: wgsl!("shared/abi", "shared/grid", "shared/attributes", "attributes"),
-    bindings: &[Access::Uniform, Access::Read, Access::Write],
+    source: wgsl!(AttributesUniform; "shared/grid", "shared/attributes", "network/attributes"),
 };
 
 pub(crate) static OCCLUSION: Kernel = Kernel {
     name: "occlusion",
     entry: "main",
-    source: wgsl!("shared/grid", "occlusion"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(OcclusionUniform; "shared/grid", "network/occlusion"),
 };
 
 const THREADS: usize = 64;
 
-impl DeviceArray {
+impl Array {
     /// Computes the attributes `[N, 11]` of packed rows `[N, 11]`; `call.parents` is ignored.
     ///
     /// # Errors

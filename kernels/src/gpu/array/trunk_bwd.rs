@@ -1,29 +1,29 @@
 //! Gradients of parts of the trunk: attributes, SPGR.
 //!
 //! CPU versions: [`crate::cpu::attributes`], [`crate::cpu::spgr`]. WGSL:
-//! kernels/attributes_bwd.wgsl; SPGR's kernels are those of [`crate::gpu::spgr_bwd`]. Tests:
+//! wgsl/network/attributes_bwd.wgsl; SPGR's kernels are those of [`crate::gpu::spgr::backward`]. Tests:
 //! tests/gpu/array_gradients.rs.
 
-use super::{DeviceArray, Function, misfit};
+use super::{Array, Function, misfit};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel, wgsl};
+use crate::gpu::kernel::{Kernel, wgsl};
 use crate::gpu::spgr::SpgrArgs;
-use crate::gpu::spgr_bwd::{SPGR_BWD, SPGR_GAINS_BWD};
-use crate::layout::{AttributesUniform, SPLAT_STRIDE, SpgrGainsBwdUniform};
+use crate::gpu::spgr::backward::{SPGR_BWD, SPGR_GAINS_BWD};
+use crate::gpu::uniforms::{AttributesUniform, SpgrGainsBwdUniform};
+use crate::layout::SPLAT_STRIDE;
 
 pub(crate) static ATTRIBUTES_BWD: Kernel = Kernel {
     name: "attributes_bwd",
     entry: "main",
-    source: wgsl!("shared/abi", "shared/grid", "shared/attributes", "attributes_bwd"),
-    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+    source: wgsl!(AttributesUniform; "shared/grid", "shared/attributes", "network/attributes_bwd"),
 };
 
 const THREADS: usize = 64;
 
-impl DeviceArray {
-    /// Computes the gradient of the packed rows of [`DeviceArray::attributes`], this array, from
+impl Array {
+    /// Computes the gradient of the packed rows of [`Array::attributes`], this array, from
     /// the gradient `dy` of the attributes.
     ///
     /// # Errors

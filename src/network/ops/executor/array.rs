@@ -95,7 +95,7 @@ impl Array for TapeArray {
     fn cat(parts: &[&Self], dim: usize) -> Result<Self> {
         let Some(first) = parts.first() else { bail!("cat: expected an array, got none") };
         let arrays: Vec<_> = parts.iter().map(|part| &part.array).collect();
-        let result = gpu::DeviceArray::joined(&arrays, dim);
+        let result = gpu::Array::joined(&arrays, dim);
         let sizes: Vec<usize> = arrays.iter().map(|part| part.dims()[dim]).collect();
         first.recorded_parts("cat", result, parts, move |dy, i| {
             dy.narrow(dim, sizes[..i].iter().sum(), sizes[i])
@@ -474,7 +474,7 @@ impl Array for TapeArray {
             bail!("spgr: expected buffers of {expected:?} floats, got {got:?}");
         }
         let made = self.array.spgr(&parents.array, &call.on_gpu(&[], &[]));
-        let host = |array: &gpu::DeviceArray| self.executor.checked(array.to_vec());
+        let host = |array: &gpu::Array| self.executor.checked(array.to_vec());
         let [own_rows, own_gains] = self.executor.checked(made)?;
         let read = self.executor.recorder.read(&[&own_rows, &own_gains]);
         for (to, from) in [&mut *rows, &mut *gains].into_iter().zip(self.executor.checked(read)?) {

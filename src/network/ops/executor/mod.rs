@@ -41,7 +41,7 @@ pub struct Executor {
     recorder: Arc<Recorder>,
     parameters: Mutex<Parameters>,
     /// Parameters in training, by the tensors of which they are copies.
-    trained: Mutex<HashMap<TensorId, gpu::DeviceArray>>,
+    trained: Mutex<HashMap<TensorId, gpu::Array>>,
     /// The first error of the device since [`Executor::attempt`] began.
     failure: Mutex<Option<GpuError>>,
     /// Number of nodes of tapes so far.
@@ -52,7 +52,7 @@ pub struct Executor {
 #[derive(Debug, Default)]
 struct Parameters {
     pass: u64,
-    arrays: HashMap<TensorId, (u64, gpu::DeviceArray)>,
+    arrays: HashMap<TensorId, (u64, gpu::Array)>,
 }
 
 impl Executor {
@@ -115,7 +115,7 @@ impl Executor {
         Ok(array)
     }
 
-    fn array(self: &Arc<Self>, result: OnDevice<gpu::DeviceArray>) -> Result<TapeArray> {
+    fn array(self: &Arc<Self>, result: OnDevice<gpu::Array>) -> Result<TapeArray> {
         let array = self.checked(result)?;
         Ok(TapeArray { array, executor: self.clone(), node: None })
     }
@@ -160,7 +160,7 @@ impl Executor {
 /// An array in the memory of an [`Executor`]'s GPU, with its place on the tape of gradients.
 #[derive(Clone, Debug)]
 pub struct TapeArray {
-    array: gpu::DeviceArray,
+    array: gpu::Array,
     executor: Arc<Executor>,
     /// The operation that made the array, where a gradient must reach it.
     node: Option<Arc<Node>>,

@@ -15,19 +15,20 @@ use crate::network::ops::spgr::Spgr;
 use candle_core::{Result, bail};
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::gpu;
+use subsplat_kernels::gpu::uniforms::AttributesUniform;
 use subsplat_kernels::gpu::{AttentionCall, Function, PointwiseFunction, Reduction};
-use subsplat_kernels::layout::{AttributesUniform, MuInput};
+use subsplat_kernels::layout::MuInput;
 
 /// Computes a gradient if it is wanted.
 pub(super) fn wanted(
     wanted: bool,
-    gradient: impl FnOnce() -> OnDevice<gpu::DeviceArray>,
-) -> OnDevice<Option<gpu::DeviceArray>> {
+    gradient: impl FnOnce() -> OnDevice<gpu::Array>,
+) -> OnDevice<Option<gpu::Array>> {
     wanted.then(gradient).transpose()
 }
 
 /// Returns factor·x.
-pub(super) fn scaled(x: &gpu::DeviceArray, factor: f32) -> OnDevice<gpu::DeviceArray> {
+pub(super) fn scaled(x: &gpu::Array, factor: f32) -> OnDevice<gpu::Array> {
     x.map(Function::Affine(factor, 0.0))
 }
 
@@ -42,7 +43,7 @@ pub(super) fn camera_floats(cameras: &[Vec<Camera>]) -> Vec<f32> {
 }
 
 impl TapeArray {
-    pub(super) fn of(&self, result: OnDevice<gpu::DeviceArray>) -> Result<Self> {
+    pub(super) fn of(&self, result: OnDevice<gpu::Array>) -> Result<Self> {
         self.executor.array(result)
     }
 
@@ -55,7 +56,7 @@ impl TapeArray {
         (weight, bias): (&Self, Option<&Self>),
         rules: ProductRules,
         activation: Option<Activation>,
-        compute: impl FnOnce(PointwiseFunction) -> OnDevice<gpu::DeviceArray>,
+        compute: impl FnOnce(PointwiseFunction) -> OnDevice<gpu::Array>,
     ) -> Result<Self> {
         // Without a bias, an array without a node takes its place.
         let none = weight.detach();
@@ -91,13 +92,13 @@ impl TapeArray {
     pub(super) fn normalised<R>(
         &self,
         name: &'static str,
-        result: OnDevice<gpu::DeviceArray>,
+        result: OnDevice<gpu::Array>,
         [factors, summands]: [&Self; 2],
         residual: Option<&Self>,
         rule: impl FnOnce() -> R,
     ) -> Result<Self>
     where
-        R: FnOnce(&gpu::DeviceArray) -> OnDevice<[gpu::DeviceArray; 3]> + Send + Sync + 'static,
+        R: FnOnce(&gpu::Array) -> OnDevice<[gpu::Array; 3]> + Send + Sync + 'static,
     {
         // Without a residual, an array without a node takes its place.
         let none = self.detach();
@@ -180,15 +181,8 @@ impl TapeArray {
 }
 
 /// Computes a gradient of a product from the gradient of the result, the input and the weight.
-pub(super) type ProductRule = Box<
-    dyn FnOnce(
-            &gpu::DeviceArray,
-            &gpu::DeviceArray,
-            &gpu::DeviceArray,
-        ) -> OnDevice<gpu::DeviceArray>
-        + Send
-        + Sync,
->;
+pub(super) type ProductRule =
+    Box<dyn FnOnce(&gpu::Array, &gpu::Array, &gpu::Array) -> OnDevice<gpu::Array> + Send + Sync>;
 
 /// Gradients of a convolution or a linear layer.
 pub(super) struct ProductRules {

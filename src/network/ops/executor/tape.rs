@@ -22,8 +22,7 @@ use subsplat_kernels::gpu::Function;
 
 /// Computes the gradients of an operation's inputs from that of its result; `None` for inputs
 /// without a node.
-type Rule =
-    Box<dyn FnOnce(&gpu::DeviceArray) -> OnDevice<Vec<Option<gpu::DeviceArray>>> + Send + Sync>;
+type Rule = Box<dyn FnOnce(&gpu::Array) -> OnDevice<Vec<Option<gpu::Array>>> + Send + Sync>;
 
 /// A leaf or a recorded operation.
 pub(super) struct Node {
@@ -52,7 +51,7 @@ impl fmt::Debug for Node {
 #[derive(Debug)]
 pub struct DeviceGradients {
     executor: Arc<Executor>,
-    leaves: BTreeMap<u64, (Option<Tensor>, gpu::DeviceArray)>,
+    leaves: BTreeMap<u64, (Option<Tensor>, gpu::Array)>,
 }
 
 impl Executor {
@@ -71,7 +70,7 @@ impl Executor {
         self: &Arc<Self>,
         results: &[(&TapeArray, &TapeArray)],
     ) -> Result<DeviceGradients> {
-        let mut open: BTreeMap<u64, (Arc<Node>, gpu::DeviceArray)> = BTreeMap::new();
+        let mut open: BTreeMap<u64, (Arc<Node>, gpu::Array)> = BTreeMap::new();
         let mut leaves = BTreeMap::new();
         for (result, gradient) in results {
             if result.array.dims() != gradient.array.dims() {
@@ -111,9 +110,9 @@ impl Executor {
     /// Adds `gradient` to that of `node`.
     fn add(
         &self,
-        open: &mut BTreeMap<u64, (Arc<Node>, gpu::DeviceArray)>,
+        open: &mut BTreeMap<u64, (Arc<Node>, gpu::Array)>,
         node: &Arc<Node>,
-        gradient: gpu::DeviceArray,
+        gradient: gpu::Array,
     ) -> Result<()> {
         let sum = match open.remove(&node.number) {
             Some((_, before)) => self.checked(before.with(&gradient, Function::Plus))?,
@@ -146,15 +145,12 @@ impl TapeArray {
     pub(super) fn recorded<const N: usize, R>(
         &self,
         name: &'static str,
-        result: OnDevice<gpu::DeviceArray>,
+        result: OnDevice<gpu::Array>,
         inputs: [&Self; N],
-        rule: impl FnOnce([bool; N], &gpu::DeviceArray) -> R,
+        rule: impl FnOnce([bool; N], &gpu::Array) -> R,
     ) -> Result<Self>
     where
-        R: FnOnce(&gpu::DeviceArray) -> OnDevice<[Option<gpu::DeviceArray>; N]>
-            + Send
-            + Sync
-            + 'static,
+        R: FnOnce(&gpu::Array) -> OnDevice<[Option<gpu::Array>; N]> + Send + Sync + 'static,
     {
         let array = self.executor.checked(result)?;
         let tracked = inputs.map(|input| input.node.is_some());
@@ -174,11 +170,11 @@ impl TapeArray {
     pub(super) fn recorded_alone<R>(
         &self,
         name: &'static str,
-        result: OnDevice<gpu::DeviceArray>,
-        rule: impl FnOnce(&gpu::DeviceArray, &gpu::DeviceArray) -> R,
+        result: OnDevice<gpu::Array>,
+        rule: impl FnOnce(&gpu::Array, &gpu::Array) -> R,
     ) -> Result<Self>
     where
-        R: FnOnce(&gpu::DeviceArray) -> OnDevice<gpu::DeviceArray> + Send + Sync + 'static,
+        R: FnOnce(&gpu::Array) -> OnDevice<gpu::Array> + Send + Sync + 'static,
     {
         self.recorded(name, result, [self], |_, y| {
             let rule = rule(&self.array, y);
@@ -191,9 +187,9 @@ impl TapeArray {
     pub(super) fn recorded_parts(
         &self,
         name: &'static str,
-        result: OnDevice<gpu::DeviceArray>,
+        result: OnDevice<gpu::Array>,
         inputs: &[&Self],
-        rule: impl Fn(&gpu::DeviceArray, usize) -> OnDevice<gpu::DeviceArray> + Send + Sync + 'static,
+        rule: impl Fn(&gpu::Array, usize) -> OnDevice<gpu::Array> + Send + Sync + 'static,
     ) -> Result<Self> {
         let array = self.executor.checked(result)?;
         let inputs: Vec<_> = inputs.iter().map(|input| input.node.clone()).collect();
