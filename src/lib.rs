@@ -92,7 +92,7 @@ pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use crate::reconstruct::{
     Check, Density, DepthBounds, DepthRange, Detail, Error, InputSize, Options, Photo, Poses,
-    Prepared, Progress, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
+    Prepared, Progress, Quality, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
     estimate_cameras, estimate_cameras_of_files,
 };
 pub use files::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};

@@ -41,7 +41,7 @@ pub enum Error {
     #[error(transparent)]
     PosePhoto(#[from] PosePhotoError),
     /// The photographs alone do not determine their cameras.
-    #[error("{photographs}: no cameras are known, and none can be estimated: {reason}")]
+    #[error("{photographs}: the photographs do not tell where their cameras were: {reason}")]
     NoPoses {
         /// The photographs.
         photographs: String,

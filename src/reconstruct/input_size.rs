@@ -25,7 +25,14 @@ pub enum InputSize {
     /// All of a scene get one shape; it cuts as little as possible of the photograph that loses
     /// most.
     Area(usize),
+    /// [`InputSize::Area`] of this number, but less where the photographs are small: an input pixel
+    /// is divided into r² Gaussians, one for each pixel of a photograph. At least the default's
+    /// number, and never more than this one.
+    AtMost(usize),
 }
+
+/// Pixels of the default input.
+const DEFAULT_AREA: usize = 256 * 256;
 
 /// Range of the input's area over the one that was asked for. A narrower range cuts more of the
 /// photographs, because the sides are multiples of the stride.
@@ -34,7 +41,7 @@ const AREA_RATIO: std::ops::RangeInclusive<f64> = 0.8..=1.25;
 impl Default for InputSize {
     /// The area of 256×256.
     fn default() -> Self {
-        Self::Area(256 * 256)
+        Self::Area(DEFAULT_AREA)
     }
 }
 
@@ -44,12 +51,23 @@ impl InputSize {
         Self::Exact { width, height }
     }
 
+    /// Replaces [`InputSize::AtMost`] by the area for photographs of the sizes `photos`, px, and
+    /// `upscale`² Gaussians a pixel. Other sizes stay.
+    #[must_use]
+    pub fn limited_to(self, photos: &[Size], upscale: usize) -> Self {
+        let Self::AtMost(most) = self else { return self };
+        let pixels = photos.iter().map(|photo| photo.width.saturating_mul(photo.height)).min();
+        let useful = pixels.unwrap_or(usize::MAX) / (upscale * upscale).max(1);
+        Self::Area(useful.max(DEFAULT_AREA).min(most))
+    }
+
     /// The size for photographs of the sizes `photos` and a model of `stride`, px. An exact size is
-    /// returned as it is. Without photographs the shape is square.
+    /// returned as it is, and [`InputSize::AtMost`] counts as [`InputSize::Area`]. Without
+    /// photographs the shape is square.
     pub fn resolve(self, photos: &[Size], stride: usize) -> Size {
         let area = match self {
             Self::Exact { width, height } => return Size { width, height },
-            Self::Area(area) => area.max(1) as f64,
+            Self::Area(area) | Self::AtMost(area) => area.max(1) as f64,
         };
         let stride = stride.max(1);
         let cells = (AREA_RATIO.end() * area / (stride * stride) as f64) as usize;

@@ -64,7 +64,7 @@ pub use estimate_cameras::{
     estimate_cameras_of_files,
 };
 pub use input_size::InputSize;
-pub use options::{Check, Detail, Options, Poses, Refine, TargetSize};
+pub use options::{Check, Detail, Options, Poses, Quality, QualitySettings, Refine, TargetSize};
 pub use photo::Photo;
 pub use poses::PoseError;
 pub use prepared::Prepared;

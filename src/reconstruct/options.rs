@@ -45,6 +45,25 @@ pub struct Options {
 }
 
 impl Options {
+    /// Sets [`Options::input_size`], [`Options::density`], the steps of [`Options::fit`], and
+    /// [`Options::refine`] by one level of quality. Setters that follow override single values.
+    ///
+    /// ```
+    /// use subsplat::reconstruct::{InputSize, Options, Quality, Refine};
+    /// let options = Options::default().with_quality(Quality::Best).with_refine(Refine::Off);
+    /// assert_eq!(options.input_size, InputSize::AtMost(512 * 512));
+    /// assert_eq!(Options::default().with_quality(Quality::Normal), Options::default());
+    /// ```
+    #[must_use]
+    pub fn with_quality(mut self, quality: Quality) -> Self {
+        let QualitySettings { input_size, density, fit_steps, refine } = quality.settings();
+        self.input_size = input_size;
+        self.density = density;
+        self.fit.steps = fit_steps;
+        self.refine = refine;
+        self
+    }
+
     /// Sets [`Options::input_size`] to these sides, px. Photographs of another shape lose what
     /// lies outside the middle.
     #[must_use]
@@ -120,12 +139,14 @@ impl Options {
         self
     }
 
-    /// Size of the network's input for photographs of the sizes `photos` and a model of `stride`, px.
-    pub fn input_size_for(&self, photos: &[Size], stride: usize) -> Size {
-        match self.target_size {
-            TargetSize::Exact(size) => self.input_size.resolve(&[size], stride),
-            _ => self.input_size.resolve(photos, stride),
-        }
+    /// Size of the network's input for photographs of the sizes `photos` and a model of `stride`, px,
+    /// whose pixels have `upscale`² Gaussians.
+    pub fn input_size_for(&self, photos: &[Size], stride: usize, upscale: usize) -> Size {
+        let shapes = match &self.target_size {
+            TargetSize::Exact(size) => std::slice::from_ref(size),
+            _ => photos,
+        };
+        self.input_size.limited_to(shapes, upscale).resolve(shapes, stride)
     }
 
     /// Options of the refinement for a number of photographs and of Gaussians.
@@ -145,6 +166,95 @@ impl Options {
             return Err(Error::argument("photographs", "at least 2", got));
         }
         DepthBounds::initial(cameras, self.depth_range, self.depth_prior.as_ref())
+    }
+}
+
+/// Quality of a scene: time and memory against sharpness, in one word. [`Quality::settings`] is the
+/// table; [`Options::with_quality`] applies it.
+///
+/// | level | input | Gaussians, at most | steps of the refinement, a photograph |
+/// |---|---|---|---|
+/// | `Fast` | 192² | 150,000 | 4 |
+/// | `Normal` | 256² | [`Density::Auto`] | 8, of at most 1.5 million Gaussians |
+/// | `High` | up to 512² | 1.5 million | 8 |
+/// | `Best` | up to 512² | 1.5 million | 16 |
+///
+/// PSNR in dB / SSIM of new views, PSNR at the inputs' own cameras, CPU-seconds and memory, one run each
+/// on a busy EPYC with AVX-512. The first two pairs chose the table; the last two columns did not. A
+/// level was measured by the single flags that it stands for. Pairs of
+/// `../shared/photos/fox`: `subsplat run fox --context 17,19 --target 18 --size 576x1024 --upscale 2
+/// --quality LEVEL`, then 3,7 with 5, then 10,16 with 12,13,14; they overlap by 96, 90 and 75 %.
+/// `examples/room`: `--context 0,1 --target 2,3,4 --size 512 --upscale 2`; its photographs are too small
+/// for a larger input.
+///
+/// | | fox 17,19 | fox 3,7 | fox 10,16 | room |
+/// |---|---|---|---|---|
+/// | `Fast` | 23.81 / .875, 27.6; 7 s, 0.3 GiB | | 20.13 / .753, 26.0; 9 s | 30.07 / .869, 33.1; 4 s, 0.2 GiB |
+/// | `Normal` | 23.75 / .877, 29.9; 23 s, 0.5 GiB | 21.90 / .833, 30.5; 21 s | 19.80 / .736, 29.8; 23 s | 31.91 / .907, 37.3; 15 s, 0.4 GiB |
+/// | `High` | 24.18 / .880, 31.6; 44 s, 1.3 GiB | 22.16 / .841, 32.1; 43 s | 19.84 / .723, 31.7; 45 s | as `Normal` |
+/// | `Best` | 24.14 / .877, 32.4; 73 s, 1.3 GiB | 22.18 / .837, 33.5; 65 s | 19.76 / .717, 33.5; 62 s | 32.25 / .912, 37.9; 22 s |
+/// | `High`, all 2.4 million, not refined | 23.90 / .867, 31.0; 27 s, 1.4 GiB | | | |
+/// | `Best`, all 2.4 million | 23.98 / .876, 32.9; 112 s, 1.7 GiB | 21.84 / .836, 35.0; 107 s | 19.62 / .717, 34.5; 115 s | |
+///
+/// A higher level therefore comes closer to the photographs at their own cameras. New views gain where
+/// the photographs overlap by 90 % or more, and not where they overlap by 75 %.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
+pub enum Quality {
+    /// A draft: a smaller input, fewer Gaussians, and half of the steps.
+    Fast,
+    /// The defaults of [`Options`].
+    #[default]
+    Normal,
+    /// A larger input, as far as the photographs have the pixels.
+    High,
+    /// [`Quality::High`] with twice the steps of the refinement.
+    Best,
+}
+
+/// The options that a [`Quality`] sets.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct QualitySettings {
+    /// [`Options::input_size`].
+    pub input_size: InputSize,
+    /// [`Options::density`].
+    pub density: Density,
+    /// [`FitOptions::steps`] of [`Options::fit`].
+    pub fit_steps: usize,
+    /// [`Options::refine`].
+    pub refine: Refine,
+}
+
+impl Quality {
+    /// All levels, the fastest first.
+    pub const ALL: [Self; 4] = [Self::Fast, Self::Normal, Self::High, Self::Best];
+
+    /// Returns the options of this level.
+    pub fn settings(self) -> QualitySettings {
+        let Options { input_size, density, fit, refine, .. } = Options::default();
+        let normal = QualitySettings { input_size, density, fit_steps: fit.steps, refine };
+        match self {
+            Self::Fast => QualitySettings {
+                input_size: InputSize::Area(192 * 192),
+                density: Density::Count(150_000),
+                refine: Refine::Each(4),
+                ..normal
+            },
+            Self::Normal => normal,
+            // As many as `Refine::Auto` refines. All of them score lower, refined or not: see `Quality`.
+            Self::High => QualitySettings {
+                input_size: InputSize::AtMost(512 * 512),
+                density: Density::Count(AUTO_GAUSSIANS_MAX),
+                ..normal
+            },
+            Self::Best => QualitySettings {
+                input_size: InputSize::AtMost(512 * 512),
+                density: Density::Count(AUTO_GAUSSIANS_MAX),
+                refine: Refine::Each(16),
+                ..normal
+            },
+        }
     }
 }
 
@@ -190,12 +300,21 @@ pub enum Refine {
     Auto,
     /// None.
     Off,
+    /// This number of steps a photograph, and at most those of eight photographs; none where
+    /// [`Options::fit`] is off.
+    Each(usize),
     /// At most this number of steps.
     Steps(usize),
     /// Steps for about this number of seconds. The result then depends on the machine. Refused where
     /// there is no clock (WebAssembly without an operating system).
     Seconds(u32),
 }
+
+/// Steps a photograph of [`Refine::Auto`].
+const AUTO_STEPS: usize = 8;
+
+/// Photographs whose steps [`Refine::Auto`] and [`Refine::Each`] allow in all.
+const PHOTOGRAPHS_MAX: usize = 8;
 
 /// Most Gaussians that [`Refine::Auto`] refines. The buffers of a refinement of two
 /// photographs take 322 bytes a Gaussian.
@@ -206,6 +325,7 @@ impl Refine {
     pub fn options_for(self, photographs: usize, gaussians: usize, fitted: bool) -> RefineOptions {
         match self {
             Self::Auto if !fitted || gaussians > AUTO_GAUSSIANS_MAX => Self::Off,
+            Self::Each(_) if !fitted => Self::Off,
             refine => refine,
         }
         .options(photographs)
@@ -223,7 +343,10 @@ impl Refine {
     fn options(self, photographs: usize) -> RefineOptions {
         let options = RefineOptions::default().with_groups(true);
         match self {
-            Self::Auto => options.with_steps((8 * photographs).min(64)),
+            Self::Auto => options.with_steps(AUTO_STEPS * photographs.min(PHOTOGRAPHS_MAX)),
+            Self::Each(steps) => {
+                options.with_steps(steps.saturating_mul(photographs.min(PHOTOGRAPHS_MAX)))
+            }
             Self::Off => options.with_steps(0),
             Self::Steps(steps) => options.with_steps(steps),
             Self::Seconds(_) => {
@@ -269,4 +392,64 @@ pub enum Detail {
     Photographs,
     /// Colours come from the network alone.
     Off,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn normal_quality_is_the_default_and_levels_differ() {
+        assert_eq!(Options::default().with_quality(Quality::Normal), Options::default());
+        let levels = Quality::ALL.map(Quality::settings);
+        for (i, a) in levels.iter().enumerate() {
+            assert!(levels[..i].iter().all(|b| a != b), "{a:?}");
+            let options = Options::default().with_quality(Quality::ALL[i]);
+            let set = QualitySettings {
+                input_size: options.input_size,
+                density: options.density,
+                fit_steps: options.fit.steps,
+                refine: options.refine,
+            };
+            assert_eq!(set, *a);
+        }
+        // The level does not touch what it does not name.
+        let adjusted = Options::default().with_poses(Poses::Adjusted);
+        assert_eq!(adjusted.with_quality(Quality::High).poses, Poses::Adjusted);
+    }
+
+    #[test]
+    fn a_larger_input_ends_at_the_pixels_of_the_photographs() {
+        let high = Options::default().with_quality(Quality::High);
+        let side = |options: &Options, side: usize, upscale: usize| {
+            let size = options.input_size_for(&[Size::new(side, side); 2], 32, upscale);
+            assert_eq!(size.width, size.height);
+            size.width
+        };
+        assert_eq!([4000, 800, 300].map(|s| side(&high, s, 2)), [512, 416, 256]);
+        assert_eq!(side(&high, 1200, 4), 288);
+        assert_eq!(side(&Options::default().with_quality(Quality::Fast), 4000, 2), 192);
+        // Pictures of a fixed size count in place of the photographs.
+        let small = high.with_target_size(TargetSize::Exact(Size::new(640, 640)));
+        assert_eq!(side(&small, 4000, 2), 320);
+    }
+
+    #[test]
+    fn steps_of_a_refinement() {
+        let steps = |refine: Refine, photographs, gaussians, fitted| {
+            refine.options_for(photographs, gaussians, fitted).steps
+        };
+        assert_eq!([2, 5, 8, 20].map(|n| steps(Refine::Auto, n, 9, true)), [16, 40, 64, 64]);
+        assert_eq!([2, 8, 20].map(|n| steps(Refine::Each(4), n, 9, true)), [8, 32, 32]);
+        let many = AUTO_GAUSSIANS_MAX + 1;
+        assert_eq!((steps(Refine::Auto, 2, many, true), steps(Refine::Auto, 2, 9, false)), (0, 0));
+        assert_eq!(
+            (steps(Refine::Each(4), 2, many, true), steps(Refine::Each(4), 2, 9, false)),
+            (8, 0)
+        );
+        assert_eq!(
+            (steps(Refine::Steps(3), 2, many, false), steps(Refine::Off, 2, 9, true)),
+            (3, 0)
+        );
+    }
 }

@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use subsplat_kernels::clock::Instant;
 
-/// A stage of a reconstruction, in the order of execution. [`fmt::Display`] gives its name.
+/// A stage of a reconstruction, in the order of execution. [`fmt::Display`] gives its description.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
 pub enum Stage {
@@ -45,7 +45,7 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// The name in reports: `crop`, `depth range`, ….
+    /// The name in reports, for programs: `crop`, `depth range`, ….
     pub fn name(self) -> &'static str {
         match self {
             Self::Poses => "poses",
@@ -60,11 +60,27 @@ impl Stage {
             Self::Refine => "refine",
         }
     }
+
+    /// What happens to the picture in this stage, for people: `cropping the photographs`, ….
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::Poses => "adjusting the cameras",
+            Self::Crop => "cropping the photographs",
+            Self::Check => "comparing the photographs",
+            Self::DepthRange => "finding the nearest and the farthest point",
+            Self::Backbone => "estimating distances",
+            Self::Primaries => "placing splats",
+            Self::Subsplat => "dividing splats",
+            Self::Detail => "adding fine texture",
+            Self::Fit => "matching sizes and colours",
+            Self::Refine => "sharpening new views",
+        }
+    }
 }
 
 impl fmt::Display for Stage {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
+        f.write_str(self.description())
     }
 }
 
@@ -329,6 +345,7 @@ mod tests {
     fn a_break_cancels() {
         let mut stop = |_: Progress| ControlFlow::Break(());
         assert!(matches!(tracker().begin(Stage::Crop, &mut stop), Err(Error::Cancelled)));
-        assert_eq!(Stage::DepthRange.to_string(), "depth range");
+        assert_eq!(Stage::DepthRange.name(), "depth range");
+        assert_eq!(Stage::Crop.to_string(), "cropping the photographs");
     }
 }

@@ -172,8 +172,9 @@ impl Reconstructor {
     ) -> Result<Prepared<'_>> {
         check_refine(options.refine)?;
         let sizes: Vec<Size> = photos.iter().map(Photo::size).collect();
-        let input_size = options.input_size_for(&sizes, self.config().stride());
-        let target_size = options.target_size.resolve(input_size, self.config().upscale);
+        let (stride, upscale) = (self.config().stride(), self.config().upscale);
+        let input_size = options.input_size_for(&sizes, stride, upscale);
+        let target_size = options.target_size.resolve(input_size, upscale);
         let crop = CropOptions { target_size, ..self.crop_options(input_size) };
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
         let (mut adjusted, mut adjustment) = (Vec::new(), None);

@@ -79,34 +79,40 @@ impl fmt::Display for Warning {
             Self::Poses { finding, .. } => f.write_str(&finding.sentence),
             Self::DepthRangeGuessed { near, far } => write!(
                 f,
-                "near {near:.4} and far {far:.4} are guesses from the distance between the \
-                 cameras; fix the depth range if you know it"
+                "the nearest and the farthest distance of the scene, {near:.4} and {far:.4}, are \
+                 guessed from the distance between the cameras, so that shapes may be wrong; give \
+                 both distances if you know them"
             ),
-            Self::InputSizeCut { requested, used, stride } => {
-                write!(f, "input size {requested} is cut to {used}, multiples of {stride}")
-            }
+            Self::InputSizeCut { requested, used, stride } => write!(
+                f,
+                "the photographs are read at {used} instead of {requested}: both sides must be \
+                 multiples of {stride} pixels"
+            ),
             Self::PhotographEnlarged { size, resized } => write!(
                 f,
-                "the photograph of {size} is enlarged to {resized}: the target shows no more \
-                 detail than the photograph has"
+                "a photograph of {size} is enlarged to {resized}: pictures of this size show no \
+                 more detail than the photograph has"
             ),
             Self::UntrainedTensors { count, upscale } => {
-                let children = upscale * upscale;
-                write!(f, "the weights lack {count} tensors of the heads for upscale {upscale}")?;
-                match children {
-                    1 => f.write_str(": each pixel gives the backbone's one Gaussian"),
-                    _ => write!(
+                write!(
+                    f,
+                    "these weights are not trained to divide a pixel into {upscale}x{upscale} splats \
+                     ({count} tensors are missing)"
+                )?;
+                match upscale * upscale {
+                    1 => f.write_str(": each pixel gives one splat"),
+                    children => write!(
                         f,
-                        ": each pixel is split evenly into {children} Gaussians, which adds no \
-                         learned detail"
+                        ": each pixel is divided evenly into {children} splats, which adds no detail"
                     ),
                 }
             }
             Self::ExposureCorrected { photo, reference, gain: [r, g, b], offset: [x, y, z] } => {
                 write!(
                     f,
-                    "photograph {photo} (counted from 0) is brought to the exposure of photograph \
-                 {reference}: gain {r:.2} {g:.2} {b:.2}, offset {x:+.0} {y:+.0} {z:+.0} of 255"
+                    "brightness and colours of photograph {photo} (counted from 0) are matched to \
+                     those of photograph {reference}: red, green and blue times {r:.2}, {g:.2} and \
+                     {b:.2}, then {x:+.0}, {y:+.0} and {z:+.0} of 255"
                 )
             }
             Self::CpuInsteadOfGpu { reason } => f.write_str(reason),

@@ -215,8 +215,8 @@ fn untrained_heads_are_a_warning() {
         assert_eq!(told(Weights::shipped(upscale).unwrap(), upscale), None);
         let backbone = Weights::shipped(upscale).unwrap().without("subsplat.");
         let expected = match upscale {
-            1 => "each pixel gives the backbone's one Gaussian",
-            _ => "each pixel is split evenly into 9 Gaussians",
+            1 => "each pixel gives one splat",
+            _ => "each pixel is divided evenly into 9 splats",
         };
         let told = told(backbone, upscale).unwrap();
         assert!(told.contains(expected), "x{upscale}: {told}");

@@ -138,8 +138,8 @@ pub fn choose_pair(scene: &Scene) -> Option<Pair> {
             let score = score(&geometry, depth, coverage(a, b))?;
             let (i, j) = (candidates[a], candidates[b]);
             let reason = format!(
-                "frames {i} and {j}: about {:.0} % overlap (85 % gives the best views), {:.1} \
-                 degrees apart, baseline {:.3} (assumed depth {depth:.3}: {origin})",
+                "about {:.0} % overlap, where 85 % gives the best views; turned by {:.1} degrees and \
+                 {:.3} apart, with the scene at about {depth:.3}: {origin}",
                 100.0 * geometry.overlap,
                 geometry.rotation_deg,
                 geometry.baseline,

@@ -17,6 +17,12 @@ pub struct Progress {
     stages: Vec<(String, f64)>,
 }
 
+impl Default for Progress {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl Progress {
     /// Starts the measurement.
     pub fn new() -> Self {
@@ -106,7 +112,7 @@ impl Progress {
 
 /// Moves the bar of [`Progress::fraction`] to a state of the library.
 pub fn show_fraction(bar: &ProgressBar, progress: subsplat::Progress) -> ControlFlow<()> {
-    bar.set_message(progress.stage.name());
+    bar.set_message(progress.stage.description());
     bar.set_position((progress.fraction * FRACTION_STEPS as f32) as u64);
     ControlFlow::Continue(())
 }

@@ -19,7 +19,7 @@ pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
     scene.warnings.iter().for_each(print_warning);
     let pairs = pairs(args, &scene)?;
     print_line(format!(
-        "{}: {} frames ({}), {} pair(s) to check",
+        "{}: {} photographs ({}), {} pair(s) to check",
         scene.name,
         scene.frames.len(),
         scene.source.name(),
@@ -47,7 +47,10 @@ pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
         }
         anyhow::Ok(())
     })?;
-    print_line(format!("epipolar pictures in {}", args.out.display()));
+    print_line(format!(
+        "pictures of the shared points and their lines are in {}",
+        args.out.display()
+    ));
     answer.finish(&json!({
         "scene": scene.name,
         "ok": good,
@@ -60,10 +63,14 @@ pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
 
 fn pairs(args: &CheckArgs, scene: &Scene) -> Result<Vec<[usize; 2]>> {
     let n = scene.frames.len();
-    ensure!(n >= 2, "{}: expected at least 2 frames, got {n}", args.input[0].display());
+    ensure!(n >= 2, "{}: expected at least 2 photographs, got {n}", args.input[0].display());
     if !args.context.is_empty() {
         let chosen = frames::indices(scene, &args.context, "--context")?;
-        ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
+        ensure!(
+            chosen.len() >= 2,
+            "--context: expected at least 2 photographs, got {}",
+            chosen.len()
+        );
         return Ok(chosen.windows(2).map(|w| [w[0], w[1]]).collect());
     }
     if n == 2 {
@@ -112,16 +119,19 @@ fn verdict_name(verdict: Verdict) -> &'static str {
 fn print_report(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
     let names = [&scene.frames[i].name, &scene.frames[j].name];
     answer.line(format!(
-        "frames {i} ({}) and {j} ({}): {}",
+        "photographs {i} ({}) and {j} ({}): {}",
         names[0],
         names[1],
         verdict_name(report.verdict)
     ));
     let median = report.epipolar.as_ref().and_then(|e| e.median_px);
     answer.line(format!(
-        "  {} matches; median epipolar error {}; baseline {:.4}, rotation {:.1}°, field of view {:.1}°×{:.1}°{}",
+        "  {} shared points; they miss the lines that the cameras predict by {}; distance of the cameras \
+         {:.4}, turned by {:.1}°, angle of view {:.1}°×{:.1}°{}",
         report.matches,
-        median.map_or("unknown".to_owned(), |m| format!("{m:.2} px at 640 px wide")),
+        median.map_or("an unknown number of pixels".to_owned(), |m| {
+            format!("{m:.2} px (median, of 640 px)")
+        }),
         report.baseline,
         report.rotation_deg,
         report.fov_deg[0][0],

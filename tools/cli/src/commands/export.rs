@@ -68,7 +68,8 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
         let options = stored.unwrap_or_else(|| RasterOptions::new(Convention::Standard));
         if options.convention == Convention::Mvsplat {
             print_warning(
-                "the viewer draws by the standard convention; mvsplat's differs a little",
+                "the scene was made for --convention mvsplat; the page draws by the standard rules, which \
+                 look a little different",
             );
         }
         let title = file.file_stem().unwrap_or_default().to_string_lossy();
@@ -81,7 +82,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     let kind = kind.trim_matches('"').to_owned();
     let of = if args.gaussians.is_some() { format!(" of {all}") } else { String::new() };
     answer.line(format!(
-        "{}: {}{of} Gaussians, SH degree {}, {:.1} MB",
+        "{}: {}{of} splats, colours of SH degree {}, {:.1} MB",
         args.out.display(),
         report.count,
         report.sh_degree,

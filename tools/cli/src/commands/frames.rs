@@ -28,13 +28,13 @@ pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>
         let mut same = (0..frames.len()).filter(|&i| stem(frames[i]) == stem(word));
         let found = same.next().with_context(|| {
             format!(
-                "{flag}: expected an index below {} or a frame's name, got `{word}`",
+                "{flag}: expected a number below {} or a photograph's name, got `{word}`",
                 frames.len()
             )
         })?;
         if let Some(other) = same.next() {
             bail!(
-                "{flag}: `{word}` may be frame {found} ({}) or {other} ({}): give the index",
+                "{flag}: `{word}` may be photograph {found} ({}) or {other} ({}): give the number",
                 frames[found],
                 frames[other]
             );
@@ -309,7 +309,7 @@ mod tests {
         }
         // `2` is an index; `2.png` is a name that two frames have.
         assert_eq!(pick("2").unwrap(), [2]);
-        for (word, hint) in [("2.png", "give the index"), ("9", "below 5"), ("", "below 5")] {
+        for (word, hint) in [("2.png", "give the number"), ("9", "below 5"), ("", "below 5")] {
             let error = pick(word).unwrap_err().to_string();
             assert!(error.contains(hint) && error.contains("--target"), "{error}");
         }

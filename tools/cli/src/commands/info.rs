@@ -50,7 +50,7 @@ pub fn head(path: &Path) -> Result<Vec<u8>> {
 fn splats(path: &Path, answer: Answer) -> Result<Value> {
     let info = splat_info(path)?;
     answer.line(format!(
-        "{}: {}, {} Gaussians, SH degree {}, {} bytes",
+        "{}: {}, {} splats, colours of SH degree {}, {} bytes",
         path.display(),
         info.flavour,
         info.count,
@@ -58,12 +58,15 @@ fn splats(path: &Path, answer: Answer) -> Result<Value> {
         info.bytes
     ));
     if let Some([low, high]) = info.bounds {
-        answer.line(format!("  means from {low:?} to {high:?}"));
+        answer.line(format!("  positions from {low:?} to {high:?}"));
     }
-    answer.line(format!("  quantiles {:?}", SplatInfo::QUANTILES));
-    answer.line(format!("  opacity   {:?}", info.opacity));
-    answer.line(format!("  sigma     {:?}", info.scale));
-    answer.line(format!("  {} invisible, {} not finite", info.invisible, info.non_finite));
+    answer.line(format!("  share of the splats below: {:?}", SplatInfo::QUANTILES));
+    answer.line(format!("  opacity, 1 is opaque:      {:?}", info.opacity));
+    answer.line(format!("  size, the scene's unit:    {:?}", info.scale));
+    answer.line(format!(
+        "  {} splats are invisible, {} have numbers that are not finite",
+        info.invisible, info.non_finite
+    ));
     info.comments.iter().for_each(|c| answer.line(format!("  comment: {c}")));
     Ok(json!({ "kind": "splats", "file": path.display().to_string(), "splats": info }))
 }
@@ -79,7 +82,7 @@ fn weights(path: &Path, answer: Answer) -> Result<Value> {
     answer.line(format!("{}: {} tensors, {parameters} parameters", path.display(), tensors.len()));
     match weights.config().map(Config::to_json) {
         Some(json) => answer.line(format!("  configuration: {}", json?)),
-        None => answer.line("  no configuration in the metadata (a bare checkpoint)"),
+        None => answer.line("  the file does not say which network it is for (a bare checkpoint)"),
     }
     let shapes: serde_json::Map<String, Value> =
         tensors.iter().map(|(name, t)| (name.clone(), json!(t.dims()))).collect();
@@ -98,8 +101,8 @@ fn picture(path: &Path, answer: Answer) -> Result<Value> {
     let header = probe_photograph(path)?;
     if let Some(orientation) = header.orientation {
         answer.line(format!(
-            "  EXIF orientation {orientation}: a photograph without a pose file is turned upright, {}x{}; a \
-             pose file describes the stored pixels",
+            "  EXIF orientation {orientation}: without a pose file it is turned upright, {}x{}; a pose \
+             file describes the pixels as they are stored",
             header.width, header.height
         ));
     }
@@ -132,7 +135,7 @@ fn picture(path: &Path, answer: Answer) -> Result<Value> {
 fn scene(path: &Path, answer: Answer) -> Result<Value> {
     let scene: Scene = load_scene(path)?;
     answer.line(format!(
-        "{}: {} frames ({}), {} sparse points",
+        "{}: {} photographs ({}), {} points of the scene",
         scene.name,
         scene.frames.len(),
         scene.source.name(),
@@ -143,7 +146,8 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
         let k = f.camera.intrinsics();
         let p = f.camera.position();
         answer.line(format!(
-            "  {i:>3} {:<12} {}x{} fx {:.1} fy {:.1} fov {:.1}°×{:.1}° at ({:.3}, {:.3}, {:.3})",
+            "  {i:>3} {:<12} {}x{} pixels, focal lengths {:.1} and {:.1} px, angle of view \
+             {:.1}°×{:.1}°, at ({:.3}, {:.3}, {:.3})",
             f.name,
             k.width,
             k.height,

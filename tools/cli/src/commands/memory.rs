@@ -49,9 +49,16 @@ impl Planned<'_> {
 pub fn check_run(planned: &Planned<'_>) -> Result<()> {
     let Planned { config, views, input: (w, h), .. } = planned;
     let r = config.upscale;
-    let source = format!("--input-size {w}x{h} with {views} views at --upscale {r}");
-    fits(&source, planned.bytes(), available())
+    let source = format!("{views} photographs read at {w}x{h} pixels, with {r}x{r} splats a pixel");
+    fits(&source, planned.bytes(), available(), RUN_HINT)
 }
+
+/// What to do where a reconstruction exceeds the memory.
+const RUN_HINT: &str =
+    "choose a smaller --input-size, --upscale or --gaussians, or fewer photographs";
+
+/// What to do where a picture exceeds the memory.
+const PICTURE_HINT: &str = "choose a smaller picture";
 
 /// Whether the memory is ample for a reconstruction: half as much again as the lower bound, which
 /// leaves room for the fit to the photographs (measured: 1.3 times the bound).
@@ -63,15 +70,15 @@ pub fn is_ample(planned: &Planned<'_>) -> bool {
 /// Rejects a picture that exceeds the memory; `source` names its flag or frame.
 pub fn check_picture(source: &str, (w, h): (usize, usize)) -> Result<()> {
     let bytes = (w as u64).saturating_mul(h as u64).saturating_mul(PER_RENDERED);
-    fits(&format!("{source} {w}x{h}"), bytes, available())
+    fits(&format!("{source} {w}x{h}"), bytes, available(), PICTURE_HINT)
 }
 
-fn fits(source: &str, needed: u64, available: Option<u64>) -> Result<()> {
+fn fits(source: &str, needed: u64, available: Option<u64>, hint: &str) -> Result<()> {
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     let enough = available.is_none_or(|a| needed <= a);
     ensure!(
         enough,
-        "{source}: needs at least {:.1} GiB of memory, {:.1} GiB are available",
+        "{source}: needs at least {:.1} GiB of memory, {:.1} GiB are available; {hint}",
         gib(needed),
         gib(available.unwrap_or(0))
     );
@@ -94,9 +101,10 @@ mod tests {
 
     #[test]
     fn too_large_runs_are_rejected_with_numbers() {
-        assert!(fits("a", 5, Some(5)).is_ok() && fits("a", 5, None).is_ok());
-        let error = fits("--size 9x9", 3 << 30, Some(1 << 30)).unwrap_err().to_string();
-        assert_eq!(error, "--size 9x9: needs at least 3.0 GiB of memory, 1.0 GiB are available");
+        assert!(fits("a", 5, Some(5), "").is_ok() && fits("a", 5, None, "").is_ok());
+        let error = fits("--size 9x9", 3 << 30, Some(1 << 30), "less").unwrap_err().to_string();
+        let told = "--size 9x9: needs at least 3.0 GiB of memory, 1.0 GiB are available; less";
+        assert_eq!(error, told);
         let config = Config::x4();
         // Far beyond any machine; the products do not overflow.
         let of = |views, side| Planned {

@@ -1,12 +1,12 @@
-//! The commands, one file each.
+//! The commands, one file each. The public modules are those that a second program shares:
+//! arguments and their values, frames, memory, the model of the arguments, animations, and the
+//! environment; beside [`crate::report`] and [`crate::failure`].
 //!
 //! Exit codes: 0 success; 1 an error, reported on stderr; 2 wrong usage; 3 a negative answer
 //! (`check`: bad poses; photographs that do not determine their cameras). With `--json` stdout always holds
 //! one object: the report, or `{"error": …}`.
 
 pub mod args;
-#[cfg(feature = "view")]
-mod args_view;
 mod check;
 pub mod depth_colour;
 pub mod environment;

@@ -47,11 +47,11 @@ pub fn load(args: &ModelRequest) -> Result<Reconstructor> {
     let config = config(args, Some((&weights, &contents)))?;
     contents.check(path, &config)?;
     let model = Reconstructor::from_weights(weights, Some(&config))
-        .with_context(|| format!("{}: does not fit the model", path.display()))?;
+        .with_context(|| format!("{}: these weights are not of this network", path.display()))?;
     let unexpected = model.unexpected_tensors();
     if let Some(first) = unexpected.first() {
         print_warning(format!(
-            "{}: {} tensors are not part of this model, first `{first}`",
+            "{}: {} tensors are not part of this network and are ignored, first `{first}`",
             path.display(),
             unexpected.len()
         ));
@@ -68,10 +68,12 @@ fn load_default(args: &ModelRequest) -> Result<Reconstructor> {
     }
     let (config, seed) = (config(args, None)?, args.seed.unwrap_or(0));
     let effect = match is_mvsplat(&config) {
-        true => "MVSplat's network gives noise",
-        false => "the small network is a plain plane sweep",
+        true => "pictures will be noise",
+        false => "distances come from colours alone, and pictures will be coarse",
     };
-    print_warning(format!("no --weights: random weights of seed {seed}; {effect}"));
+    print_warning(format!(
+        "the network is untrained (random weights of seed {seed}): {effect}; --weights names trained ones"
+    ));
     Ok(Reconstructor::untrained(&config, seed)?)
 }
 
@@ -132,12 +134,13 @@ impl Contents {
         let mvsplat = is_mvsplat(config);
         ensure!(
             self.mvsplat || self.small,
-            "{path}: expected the weights of a backbone (re10k or small), got a file without one"
+            "{path}: expected the weights of a whole network (re10k or small), got a file without the part \
+             that estimates distances"
         );
         if !(if mvsplat { self.mvsplat } else { self.small }) {
             let name = |mvsplat| if mvsplat { "re10k" } else { "small" };
             bail!(
-                "{path}: expected weights of the {} backbone, got the {} one",
+                "{path}: expected weights of the network {}, got those of {}; choose it by --backbone",
                 name(mvsplat),
                 name(!mvsplat)
             );
@@ -146,8 +149,8 @@ impl Contents {
         let fixed = !config.spgr.head.serves_any_k();
         ensure!(
             !fixed || children == config.children(),
-            "{path}: expected weights for --upscale {} ({} children per pixel), got weights for \
-             --upscale {} ({children} children)",
+            "{path}: expected weights for --upscale {} ({} splats a pixel), got weights for --upscale \
+             {} ({children} splats a pixel); leave --upscale out, or choose other weights",
             config.upscale,
             config.children(),
             children.isqrt()

@@ -303,7 +303,7 @@ fn check_format(format: SceneFormatArg, count: u64, bytes: u64, min_opacity: f32
     let name = format.file_name();
     let limit = match format {
         SceneFormatArg::Spz | SceneFormatArg::Html if count > SPZ_COUNT_MAX => {
-            Some(format!("at most {SPZ_COUNT_MAX} Gaussians"))
+            Some(format!("at most {SPZ_COUNT_MAX} splats"))
         }
         SceneFormatArg::Glb if bytes > GLB_BYTES_MAX => {
             Some(format!("at most {:.1} GB", GLB_BYTES_MAX as f64 / 1e9))
@@ -312,14 +312,14 @@ fn check_format(format: SceneFormatArg, count: u64, bytes: u64, min_opacity: f32
     };
     if let Some(limit) = limit.filter(|_| min_opacity == 0.0) {
         bail!(
-            "--save: {name} holds {limit}, and this run gives {count} Gaussians ({:.1} GB); choose \
-             another format, a smaller --upscale or --input-size, or --min-opacity",
+            "--save: {name} holds {limit}, and this run gives {count} splats ({:.1} GB); choose another \
+             format, or fewer splats by --gaussians or a smaller --upscale",
             bytes as f64 / 1e9
         );
     }
     if bytes > ANNOUNCED {
         let size = bytes as f64 / 1e6;
-        print_line(format!("{name}: at most {size:.0} MB for {count} Gaussians"));
+        print_line(format!("{name} takes up to {size:.0} MB for {count} splats"));
     }
     Ok(())
 }
@@ -365,7 +365,7 @@ mod tests {
             check_format(format, count, bytes_at_most(format, count, 3, None), opacity)
         };
         let error = check(Spz, 10_000_001, 0.0).unwrap_err().to_string();
-        assert!(error.contains("scene.spz holds at most 10000000 Gaussians"), "{error}");
+        assert!(error.contains("scene.spz holds at most 10000000 splats"), "{error}");
         assert!(check(Html, 10_000_001, 0.0).is_err());
         assert!(check(Spz, 10_000_001, 0.1).is_ok() && check(Spz, 10_000_000, 0.0).is_ok());
         let error = check(Glb, 20_000_000, 0.0).unwrap_err().to_string();

@@ -35,10 +35,13 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
         return Ok(estimated.scene);
     }
     let [one] = input else {
-        bail!("expected photographs or one scene, got {} paths", input.len())
+        bail!("expected photographs, or one scene, got {} paths", input.len())
     };
     if let Some(flag) = args.first_flag() {
-        bail!("{flag}: only with photographs; {} has its own cameras", one.display());
+        bail!(
+            "{flag}: only with photographs; {} has its own cameras, leave the flag out",
+            one.display()
+        );
     }
     let scene = load_scene(one)?;
     let Some(convention) = args.pose_convention else { return Ok(scene) };
@@ -128,12 +131,13 @@ pub fn print_estimate(estimated: &EstimatedScene) {
     let estimate = &estimated.estimate;
     let placed = estimate.cameras.iter().flatten().count();
     let certain = match estimate.confidence {
-        Confidence::High => "high confidence",
-        Confidence::Low => "LOW confidence",
+        Confidence::High => "reliable",
+        Confidence::Low => "DOUBTFUL",
     };
     print_line(format!(
-        "cameras of {placed} of {} photographs estimated from {} points: {certain} (standard \
-         deviation {:.2}° of rotations, {:.2}° of directions); unit: the points' median depth",
+        "the cameras of {placed} of {} photographs were found by {} points: {certain} (rotations \
+         within about {:.2}°, directions between cameras within {:.2}°); the unit of length is the \
+         median distance of the points",
         estimate.cameras.len(),
         estimate.points.len(),
         estimate.rotation_error_deg,
@@ -152,7 +156,8 @@ pub fn print_estimate(estimated: &EstimatedScene) {
             match estimate.focal.deviation {
                 0.0 => String::new(),
                 // A lens's distortion and its principal point can change it by far more.
-                d => format!(", then estimated (matching noise alone: ±{:.1} %)", 100.0 * d),
+                d =>
+                    format!(", then adjusted to the points (±{:.1} % from their noise)", 100.0 * d),
             }
         ));
     }

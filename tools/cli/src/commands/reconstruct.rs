@@ -1,6 +1,6 @@
 //! The library's call with a progress bar and lines for the user: for `run` and `view`.
 
-use super::args::{CropShapeArg, DetailArg, QualityArg, SourceArgs};
+use super::args::{CropShapeArg, DetailArg, SourceArgs};
 use super::memory::{self, Planned};
 use crate::pages;
 use crate::report::{Progress, print_line, print_warning, show_fraction};
@@ -15,7 +15,7 @@ use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::finish::RefineReport;
 use subsplat::{
-    Check, DepthBounds, DepthRange, Detail, FitOptions, InputSize, Options, Photo, Poses, Prepared,
+    Check, DepthBounds, DepthRange, Detail, InputSize, Options, Photo, Poses, Prepared, Quality,
     Reconstruction, Reconstructor, TargetSize,
 };
 use subsplat_kernels::camera::Size;
@@ -32,22 +32,23 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         DetailArg::Photo => Detail::Photographs,
         DetailArg::Off => Detail::Off,
     };
-    let options = Options::default()
+    let mut options = Options::default()
+        .with_quality(Quality::from(args.quality))
+        .with_density(args.density())
         .with_depth_range(DepthRange::from_ends(args.near, args.far))
         .with_depth_prior(DepthBounds::of_scene(scene, context)?)
         .with_check(check)
         .with_detail(detail)
-        .with_fit(FitOptions::default().with_steps(args.fit))
-        .with_poses(poses)
-        .with_density(args.gaussians)
-        .with_refine(args.refine);
+        .with_poses(poses);
+    options.fit.steps = args.fit.unwrap_or(options.fit.steps);
+    options.refine = args.refine.unwrap_or(options.refine);
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
     options.initial_depth_range(&cameras)?;
     Ok(options)
 }
 
 /// Chooses the size of the network's input for frames `context` and pictures of size `target`:
-/// `--quality`, else `--input-size`. Returns the width and height that it gives, px, too.
+/// `--input-size`, else that of `--quality`. Returns the width and height that it gives, px, too.
 ///
 /// # Errors
 /// A size that is too small for the network or too large for the memory.
@@ -67,13 +68,13 @@ pub fn input_size(
         _ => context.iter().map(size).collect(),
     };
     let config = model.config();
-    let (views, density) = (context.len(), args.gaussians);
+    let (views, density) = (context.len(), args.density());
     let ample = |size: Size| {
         memory::is_ample(&Planned { config, views, input: (size.width, size.height), density })
     };
-    let chosen = match args.quality {
-        Some(quality) => quality_size(quality, args.crop, &photos, config, ample),
-        None => args.input_size(),
+    let chosen = match args.input_size() {
+        InputSize::Exact { width, height, .. } => InputSize::exact(width, height),
+        size => size_within(size, args.crop, &photos, config, ample),
     };
     let Size { width: w, height: h } = chosen.resolve(&photos, config.stride());
     let stride = config.stride();
@@ -112,15 +113,15 @@ pub fn with_children(
         }
         _ => model,
     };
-    let (config, density) = (model.config(), args.gaussians);
+    let (config, density) = (model.config(), args.density());
     memory::check_run(&Planned { config, views, input, density })?;
     Ok(model)
 }
 
-/// The size of `quality` for photographs of the sizes `photos`. `High` is limited by the
-/// photographs, whose pixels a target need not exceed, and by the memory.
-fn quality_size(
-    quality: QualityArg,
+/// The size for photographs of the sizes `photos`: an area, in the shape that `crop` says. What
+/// [`InputSize::AtMost`] allows is limited by the photographs and by the memory.
+fn size_within(
+    size: InputSize,
     crop: CropShapeArg,
     photos: &[Size],
     config: &Config,
@@ -130,17 +131,19 @@ fn quality_size(
         CropShapeArg::Whole => InputSize::Area(area),
         CropShapeArg::Square => InputSize::exact(area.isqrt(), area.isqrt()),
     };
-    let normal = QualityArg::Normal.area();
-    if quality != QualityArg::High {
-        return of_area(quality.area());
-    }
-    let pixels = |photo: &Size| match crop {
-        CropShapeArg::Whole => photo.width * photo.height,
-        CropShapeArg::Square => photo.width.min(photo.height).pow(2),
+    let may_shrink = matches!(size, InputSize::AtMost(_));
+    let used = |photo: &Size| match crop {
+        CropShapeArg::Whole => *photo,
+        CropShapeArg::Square => {
+            let side = photo.width.min(photo.height);
+            Size::new(side, side)
+        }
     };
-    let photo = photos.iter().map(pixels).min().unwrap_or(0) / config.children();
-    let mut area = quality.area().min(photo).max(normal);
-    while area > normal && !ample(of_area(area).resolve(photos, config.stride())) {
+    let used: Vec<Size> = photos.iter().map(used).collect();
+    let InputSize::Area(mut area) = size.limited_to(&used, config.upscale) else { return size };
+    let InputSize::Area(normal) = InputSize::default() else { return size };
+    let fits = |area: usize| ample(of_area(area).resolve(photos, config.stride()));
+    while may_shrink && area > normal && !fits(area) {
         area = (area / 2).max(normal);
     }
     of_area(area)
@@ -173,18 +176,24 @@ fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {
     print_line(crop_line(prepared.inputs(), prepared.cut_shares()));
     match prepared.pose_adjustment() {
         Some(a) => print_line(format!(
-            "the poses were adjusted by {} points, the largest change of a rotation is {:.2} degrees; \
-             the points' median error was {:.2} px and is {:.2} px",
+            "the cameras were adjusted by {} points that the photographs share: turned by {:.2} degrees \
+             at most; the points missed by {:.2} px in the median and now by {:.2} px",
             a.points, a.turned_deg, a.before_px, a.after_px
         )),
         None if poses == Poses::Adjusted => {
-            print_line("the poses stay: they fit the photographs, or too few points are matched");
+            print_line(
+                "the cameras stay as they are: they fit the photographs, or the photographs share too \
+                 few points to tell",
+            );
         }
         None => {}
     }
     prepared.warnings().iter().for_each(print_warning);
     if prepared.reports().iter().any(|r| r.verdict == Verdict::Bad) {
-        print_warning("these poses look wrong, and so will the result; `subsplat check` says more");
+        print_warning(
+            "these cameras do not fit the photographs, so the scene will be smeared; `subsplat check` \
+             shows where",
+        );
     }
     print_depth_range(prepared.depth_range());
 }
@@ -197,29 +206,30 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
     }
     result.warnings().iter().skip(printed).for_each(print_warning);
     if result.detail() == Detail::Photographs {
-        print_line("the photographs add detail to colours (--detail off: the network alone)");
+        print_line("fine texture comes from the full photographs (--detail off leaves it out)");
     }
     if let Some(fit) = result.fit() {
         let FitReport { before, after, .. } = fit;
         print_line(format!(
-            "the fit to the photographs changed their loss from {before:.5} to {after:.5} (--fit 0: \
-             the network's Gaussians)"
+            "sizes, opacities and colours of the splats were matched to the photographs: pictures of \
+             the scene differed from them by {before:.5} and now by {after:.5} (--fit 0 leaves this out)"
         ));
     }
     if let Some(refinement) = result.refinement() {
         let RefineReport { steps, before, after, removed, .. } = refinement;
         let removed = match removed {
             0 => String::new(),
-            n => format!("; {n} Gaussians that the photographs hardly show were removed"),
+            n => format!("; {n} splats that hardly show were removed"),
         };
         print_line(format!(
-            "{steps} steps of refinement changed the error of photographs drawn from the others' \
-             Gaussians from {before:.5} to {after:.5} (--refine off: none){removed}"
+            "the splats were moved and reshaped in {steps} steps: photographs, drawn again from the \
+             splats of the others, differed by {before:.5} and now by {after:.5} (--refine off leaves \
+             this out){removed}"
         ));
     }
 }
 
-/// Describes the network's input and what the crop leaves out of the photographs.
+/// Says how many pixels the network reads, and what the crop leaves out of the photographs.
 fn crop_line(inputs: &[Cropped], cut_shares: &[f32]) -> String {
     let (w, h) = inputs.first().map_or((0, 0), |c| (c.input.width, c.input.height));
     let percent = |share: f32| format!("{:.0} %", 100.0 * share);
@@ -234,12 +244,12 @@ fn crop_line(inputs: &[Cropped], cut_shares: &[f32]) -> String {
             )
         }
     };
-    format!("input {w}x{h}: {cut}")
+    format!("the network reads {w}x{h} pixels: {cut}")
 }
 
 fn print_depth_range(bounds: &DepthBounds) {
     let DepthBounds { near, far, source } = bounds;
-    print_line(format!("near {near:.4}, far {far:.4}: {source}"));
+    print_line(format!("the scene lies at distances from {near:.4} to {far:.4}: {source}"));
 }
 
 /// Formats the reports of the check as JSON.
@@ -266,17 +276,22 @@ mod tests {
     #[test]
     fn high_quality_is_limited_by_photographs_and_memory() {
         let config = Config::small(subsplat::network::config::Preset::Tuned, 2);
-        let size = |quality, crop, (width, height): (usize, usize), ample: bool| {
+        let size = |quality: Quality, crop, (width, height): (usize, usize), ample: bool| {
             let photos = [Size { width, height }; 2];
-            let chosen = quality_size(quality, crop, &photos, &config, |_| ample);
+            let wanted = quality.settings().input_size;
+            let chosen = size_within(wanted, crop, &photos, &config, |_| ample);
             let size = chosen.resolve(&photos, 32);
             (size.width, size.height)
         };
         use CropShapeArg::{Square, Whole};
-        use QualityArg::{Fast, High, Normal};
+        use Quality::{Best, Fast, High, Normal};
         assert_eq!(size(Fast, Whole, (4000, 4000), true), (192, 192));
+        // A size that is asked for stays where the memory is short: the run is refused instead.
+        assert_eq!(size(Fast, Whole, (4000, 4000), false), (192, 192));
         assert_eq!(size(Normal, Whole, (4000, 4000), true), (256, 256));
+        assert_eq!(size(Normal, Square, (4000, 2000), true), (256, 256));
         assert_eq!(size(High, Whole, (4000, 4000), true), (512, 512));
+        assert_eq!(size(Best, Whole, (4000, 4000), true), (512, 512));
         assert_eq!(size(High, Whole, (4000, 4000), false), (256, 256));
         assert_eq!(size(High, Whole, (800, 800), true), (416, 416));
         assert_eq!(size(High, Whole, (300, 300), true), (256, 256));
@@ -288,12 +303,15 @@ mod tests {
         let camera = Camera::new(Intrinsics::from_fov_x(1.0, 64, 48), Mat4::IDENTITY).unwrap();
         let inputs = [crop(&Rgb::black(64, 48), &camera, &CropOptions::square(32, 1, 32)).unwrap()];
         for (shares, expected) in [
-            ([0.0, 0.004], "input 32x32: the whole photographs"),
-            ([0.25, 0.25], "input 32x32: 25 % of each photograph is cut at its edges"),
+            ([0.0, 0.004], "the network reads 32x32 pixels: the whole photographs"),
+            (
+                [0.25, 0.25],
+                "the network reads 32x32 pixels: 25 % of each photograph is cut at its edges",
+            ),
             (
                 [0.1, 0.33],
-                "input 32x32: the photographs differ in shape: 10 % to 33 % of each is cut at its \
-                 edges",
+                "the network reads 32x32 pixels: the photographs differ in shape: 10 % to 33 % of each \
+                 is cut at its edges",
             ),
         ] {
             assert_eq!(crop_line(&inputs, &shares), expected);

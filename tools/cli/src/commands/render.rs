@@ -78,7 +78,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let seconds = progress.seconds();
     let peak = peak_memory_bytes();
     answer.line(format!(
-        "{} Gaussians, {} views in {}; {:.1} s{}",
+        "{} splats, {} views in {}; {:.1} s{}",
         splats.len(),
         views.len(),
         args.out.display(),
@@ -159,7 +159,7 @@ pub fn options(
     options.background = args.background.unwrap_or(options.background);
     if matches!(args.lowpass_ref, Some(LowpassArg::Input)) {
         print_warning(
-            "--lowpass-ref input: ignored, since a scene file does not state its input's size",
+            "--lowpass-ref input: ignored, since a scene file does not say how many pixels the network read",
         );
     }
     Ok(options)
@@ -219,10 +219,11 @@ fn named_cameras(
         let camera = camera_of_comments(comments);
         print_line(match camera {
             Some(_) => {
-                "no cameras given and no cameras.json beside the scene: the file's own camera"
+                "no --cameras and no cameras.json beside the scene: drawn from the file's own camera"
             }
             None => {
-                "no cameras given and no cameras.json beside the scene: a view of the whole from the side of its smaller Gaussians"
+                "no --cameras and no cameras.json beside the scene: a view of the whole, from the side on \
+                 which it was probably photographed"
             }
         });
         return Ok(vec![(

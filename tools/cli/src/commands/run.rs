@@ -135,7 +135,8 @@ fn check_opacity(splats: &Splats, least: f32) -> Result<()> {
     let most = opacities.fold(0.0f32, f32::max);
     ensure!(
         most >= least,
-        "--min-opacity: expected at most {most}, the highest opacity of {} Gaussians, got {least}",
+        "--min-opacity: expected at most {most}, the highest opacity of the scene's {} splats, got \
+         {least}",
         splats.len()
     );
     Ok(())
@@ -155,7 +156,7 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     scene.warnings.iter().for_each(print_warning);
     let (context, reason) = context(&args.source.context, &args.input[0], &scene)?;
     print_line(format!(
-        "{}: {} frames ({}); context {reason}",
+        "{}: {} photographs ({}); the scene is made from {reason}",
         scene.name,
         scene.frames.len(),
         scene.source.name(),
@@ -192,40 +193,43 @@ pub fn context(named: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usi
     let list = |frames: &[usize]| frames.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
     if !named.is_empty() {
         let chosen = frames::indices(scene, named, "--context")?;
-        ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
+        ensure!(
+            chosen.len() >= 2,
+            "--context: expected at least 2 photographs, got {}",
+            chosen.len()
+        );
         for (n, i) in chosen.iter().enumerate() {
             let name = &scene.frames[*i].name;
             ensure!(
                 !chosen[..n].contains(i),
-                "--context: expected different frames, got {name} twice"
+                "--context: expected different photographs, got {name} twice"
             );
         }
-        let text = format!("{} as given", list(&chosen));
+        let text = format!("{}, as given", list(&chosen));
         return Ok((chosen, text));
     }
     if scene.frames.len() == 2 {
-        return Ok((vec![0, 1], "0,1: the only two".to_owned()));
+        return Ok((vec![0, 1], "both".to_owned()));
     }
     if let Some(test) = frames::protocol(input, scene)?.into_iter().next()
         && test.context.len() >= 2
     {
-        let text = format!("{} from protocol.json", list(&test.context));
+        let text = format!("{}, as protocol.json says", list(&test.context));
         return Ok((test.context, text));
     }
     let count = scene.frames.len();
     if scene.source == SceneFormat::Photographs && count <= CONTEXT_MAX {
         let all: Vec<usize> = (0..count).collect();
-        let text = format!("{}: all photographs", list(&all));
-        return Ok((all, text));
+        return Ok((all, "all of them".to_owned()));
     }
     let Some(pair) = choose_pair(scene) else {
         bail!(
-            "{}: expected two photographs taken from different places, got {} frames at one",
+            "{}: expected two photographs taken from different places, got {} from one place",
             scene.name,
             scene.frames.len()
         )
     };
-    let text = format!("{}: {}", list(&pair.frames), pair.reason);
+    let text = format!("{} ({})", list(&pair.frames), pair.reason);
     Ok((pair.frames.to_vec(), text))
 }
 
@@ -240,7 +244,7 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
     };
     if chosen.is_empty() {
         print_line(format!(
-            "no target frames: {} views from the first context to the last",
+            "no photographs are left to compare with: {} views from the first camera to the last",
             path_frames(args)
         ));
     }
@@ -367,6 +371,7 @@ impl Done {
             "input_intrinsics": result.inputs().iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
             "backbone": if is_mvsplat(config) { "re10k" } else { "small" },
             "upscale": config.upscale,
+            "quality": args.source.quality.name(),
             "target_size": result.inputs().first().map(|c| [c.target.width, c.target.height]),
             "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
             "weights": args.source.weights.as_ref().map(|p| p.display().to_string()),
@@ -406,7 +411,7 @@ impl Done {
         subsplat::files::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes()))?;
         self.print_scores(answer);
         answer.line(format!(
-            "{} Gaussians, {} views in {}; {total:.1} s{}",
+            "{} splats, {} views in {}; {total:.1} s{}",
             self.result.splats().len(),
             self.scored.len(),
             args.out.display(),
@@ -421,7 +426,7 @@ impl Done {
         };
         let compared: Vec<&Scored> = self.scored.iter().filter(|s| s.psnr.is_some()).collect();
         for s in &compared {
-            let note = if s.enlarged { "  (photograph smaller than the target)" } else { "" };
+            let note = if s.enlarged { "  (photograph smaller than the picture)" } else { "" };
             let (psnr, ssim) = (cell(s.psnr, 2), cell(s.ssim, 4));
             answer.line(format!("  {:<12} PSNR {psnr}  SSIM {ssim}{note}", s.name));
         }

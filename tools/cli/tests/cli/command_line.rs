@@ -256,20 +256,26 @@ fn the_shape_of_photographs_is_kept() {
         let k = &report["input_intrinsics"][0];
         let cut = report["cut_shares"][1].as_f64().unwrap();
         let size = [&k["width"], &k["height"]].map(|v| v.as_u64().unwrap());
-        (size, (100.0 * cut).round() as i64, called.stderr)
+        let count = report["gaussians"].as_u64().unwrap();
+        (size, (100.0 * cut).round() as i64, called.stderr, count)
     };
     for (inputs, more, size, cut, line) in [
         ("wide.png wide2.png", "--input-size 128", [160, 96], 0, "the whole photographs"),
         ("wide.png wide2.png", "--input-size 128 --crop square", [128, 128], 40, "40 % of each"),
         ("wide.png wide2.png", "--input-size 64x96", [64, 96], 60, "60 % of each"),
         ("wide.png wide2.png", "--quality fast", [256, 160], 4, "4 % of each"),
+        ("wide.png wide2.png", "--quality best --input-size 64x96", [64, 96], 60, "60 % of each"),
         ("tall.png tall.png", "--input-size 128", [96, 160], 0, "the whole photographs"),
         ("wide.png tall.png", "--input-size 128", [128, 128], 40, "40 % of each"),
     ] {
         let got = run(inputs, more);
         assert_eq!((got.0, got.1), (size, cut), "{inputs} {more}");
-        let told = format!("input {}x{}: {line}", size[0], size[1]);
+        let told = format!("the network reads {}x{} pixels: {line}", size[0], size[1]);
         assert!(got.2.contains(&told), "{inputs} {more}: {}", got.2);
+        // 256x160 pixels of two photographs have 327,680 splats; a draft has fewer.
+        if more == "--quality fast" {
+            assert!((140_000..=150_000).contains(&got.3), "{}", got.3);
+        }
     }
 }
 
@@ -374,7 +380,7 @@ fn weights_say_what_they_are_for() {
     );
     let called = call_in(place.path(), &format!("{run} --backbone re10k"));
     assert_eq!(called.code, 1);
-    assert!(called.error().contains("got the small one"), "{}", called.error());
+    assert!(called.error().contains("got those of small"), "{}", called.error());
 
     let called = call_in(place.path(), &format!("{run} --upscale 2"));
     match config.spgr.head {
@@ -383,7 +389,7 @@ fn weights_say_what_they_are_for() {
         _ => {
             assert_eq!(called.code, 1);
             let error = called.error();
-            let parts = ["w.safetensors", "--upscale 2 (4 children", "--upscale 4 (16 children"];
+            let parts = ["w.safetensors", "--upscale 2 (4 splats", "--upscale 4 (16 splats"];
             assert!(parts.iter().all(|p| error.contains(p)), "{error}");
         }
     }

@@ -14,7 +14,7 @@ mod pictures;
 mod source;
 mod window;
 
-use super::args_view::{LevelsArg, ViewArgs};
+use super::args::view::{LevelsArg, ViewArgs};
 use super::memory;
 use crate::report::{Answer, Progress, print_line};
 use anyhow::{Context, Result, bail};
@@ -54,7 +54,7 @@ pub fn view(args: &ViewArgs, answer: Answer) -> Result<()> {
     let done = window::run(events, plan, source)?;
     let saved: Vec<String> = done.saved.iter().map(|p| p.display().to_string()).collect();
     answer.line(format!(
-        "{}: {} Gaussians, {} frames on {}{}",
+        "{}: {} splats, {} pictures on {}{}",
         done.name,
         done.gaussians,
         done.frames,

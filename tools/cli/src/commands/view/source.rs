@@ -1,7 +1,7 @@
 //! Source of the splats in the window: a finished scene, or photographs, which can be
 //! reconstructed again with another number of children.
 
-use crate::commands::args_view::ViewArgs;
+use crate::commands::args::view::ViewArgs;
 use crate::commands::frames::DepthSpread;
 use crate::commands::memory::{self, Planned};
 use crate::commands::reconstruct::{self, reconstruct};
@@ -18,7 +18,7 @@ use subsplat::scene::navigation::{Start, up_of};
 use subsplat::scene::render::camera_of_comments;
 use subsplat::scene::splats::Splats;
 use subsplat::{
-    Check, Options, Photo, Reconstruction, Reconstructor, Refine, Renderer, TargetSize,
+    Check, Options, Photo, Reconstruction, Reconstructor, Refine, Renderer, Stage, TargetSize,
 };
 use subsplat_kernels::layout::RasterOptions;
 
@@ -124,7 +124,11 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     scene.warnings.iter().for_each(print_warning);
     let first = args.input.first().context("no input")?;
     let (context, reason) = run::context(&args.source.context, first, &scene)?;
-    print_line(format!("{}: {} frames; context {reason}", scene.name, scene.frames.len()));
+    print_line(format!(
+        "{}: {} photographs; the scene is made from {reason}",
+        scene.name,
+        scene.frames.len()
+    ));
     let mut options = reconstruct::options(&args.source, &scene, &context)?;
     let model = progress.stage("model", |_| load_model(args, args.source.children_side()))?;
     let (source, target) = (&args.source, args.source.target_size());
@@ -191,7 +195,7 @@ impl Photographs {
         let made = match first.filter(|f| f.upscale == upscale) {
             Some(first) => first,
             None => {
-                begin("model");
+                begin("reading the network");
                 let model = load_model(&self.args, Some(upscale))?;
                 memory::check_run(&Planned {
                     config: model.config(),
@@ -200,7 +204,7 @@ impl Photographs {
                     density: self.options.density,
                 })?;
                 let mut progress = |progress: subsplat::Progress| {
-                    begin(progress.stage.name());
+                    begin(progress.stage.description());
                     ControlFlow::Continue(())
                 };
                 // The sizes of --upscale are those of the first scene.
@@ -214,7 +218,7 @@ impl Photographs {
         if self.refine == Refine::Off {
             return Ok(());
         }
-        begin("refine");
+        begin(Stage::Refine.description());
         made.refine(self.refine, show)
     }
 
@@ -285,7 +289,7 @@ mod tests {
                 Ok(())
             };
             photographs.make(2, &mut |stage| stages.push(stage), &mut show).unwrap();
-            assert_eq!(stages, ["refine"]);
+            assert_eq!(stages, [Stage::Refine.description()]);
         }
         (source, all)
     }

@@ -7,7 +7,7 @@ use super::controls::{Controls, Drag, KeyAction};
 use super::detail::{Detail, Fit, Outcome};
 use super::pictures::save_next;
 use super::source::{Made, Photographs, Source};
-use crate::commands::args_view::KEYS;
+use crate::commands::args::view::KEYS;
 use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result};
 use glam::Vec2;
@@ -316,7 +316,7 @@ impl Viewer {
         let Some(ready) = self.ready.values_mut().find(|r| r.number == number) else { return };
         match ready.detail.finish(outcome) {
             Ok(()) => self.change(),
-            Err(e) => print_warning(format!("level of detail: {e:#}; all Gaussians are drawn")),
+            Err(e) => print_warning(format!("fewer splats far away: {e:#}; all splats are drawn")),
         }
     }
 
@@ -375,7 +375,8 @@ impl Viewer {
             }
             KeyAction::Upscale(r) if self.photographs.is_none() => {
                 print_line(format!(
-                    "x{r}: {} is a finished scene and has one resolution",
+                    "x{r}: {} is a finished scene, whose resolution is fixed; open its photographs to \
+                     change it",
                     self.name
                 ));
             }
@@ -417,7 +418,7 @@ impl Viewer {
             return;
         };
         let (r, gpu, proxy) = (self.requested, canvas.gpu().clone(), self.proxy.clone());
-        self.busy = Some((r, "begins"));
+        self.busy = Some((r, "beginning"));
         // A closed event loop needs no message.
         let work = move || {
             let mut stage = |name| drop(proxy.send_event(Message::Stage(name)));

@@ -1,10 +1,10 @@
 //! Arguments of `view`, and its keys.
 
-use super::args::{ConventionArg, CropShapeArg, DetailArg, RenderingArgs, SourceArgs};
-use super::values;
+use super::groups::{PICTURES, SIZE};
+use super::{ConventionArg, CropShapeArg, DetailArg, QualityArg, RenderingArgs, SourceArgs};
+use crate::commands::values;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
-use subsplat::{FitOptions, Refine};
 use subsplat_kernels::gpu::DeviceChoice;
 
 /// The window's keys, which `--help` and the H key show.
@@ -16,8 +16,8 @@ In the window:
   W A S D Q E              forward, left, back, right, down, up; with shift four times as fast
   F                        orbit or fly
   R                        back to the first camera
-  1 2 4                    children a side of a pixel: x1, x2, x4 (of photographs)
-  L                        all Gaussians, or fewer where they are far
+  1 2 4                    resolution of the scene: x1, x2, x4 (of photographs)
+  L                        all splats, or fewer where they are far away
   P                        save the picture
   H                        this list
   Esc                      quit";
@@ -25,59 +25,89 @@ In the window:
 /// Gaussians that the window draws.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum LevelsArg {
-    /// Gaussians far below a pixel are replaced by fewer, merged ones.
+    /// Splats far smaller than a pixel are replaced by fewer, merged ones: faster.
     Auto,
-    /// All Gaussians.
+    /// All splats.
     Off,
 }
 
 /// Arguments of `view`.
 #[derive(Clone, Debug, Args)]
 pub struct ViewArgs {
-    /// A finished scene (.ply, .compressed.ply, .splat, .spz, .ksplat, .glb); or a scene folder,
-    /// a pose file, photographs or a folder of them, which are reconstructed first.
+    /// A finished scene, or photographs, a folder of them, or a scene with cameras.
+    ///
+    /// A finished scene is a .ply, .compressed.ply, .splat, .spz, .ksplat or .glb. Of anything else a
+    /// scene is made first, as by `run`.
     #[arg(required = true, num_args = 1.., value_name = "SPLATS | SCENE | IMG… | DIR")]
     pub input: Vec<PathBuf>,
-    /// Initial size of the window, px: N, or WxH (default: the first camera's picture, at most
-    /// 1280x960).
-    #[arg(long, value_name = "N | WxH", value_parser = values::size)]
-    pub size: Option<(usize, usize)>,
-    /// Device for rendering: gpu (any adapter), auto (no software adapter), or an adapter by a
-    /// part of its name.
-    #[arg(long, default_value = "gpu", value_name = "auto|gpu|NAME")]
-    pub device: String,
-    /// Draw this many frames and quit.
-    #[arg(long, value_name = "N", value_parser = values::frames)]
-    pub frames: Option<usize>,
-    /// Save the last of `--frames` (PNG).
-    #[arg(long, value_name = "FILE", requires = "frames")]
-    pub save: Option<PathBuf>,
-    /// Folder for the pictures that P saves, as NAME-0001.png and so on.
+    /// Folder for the pictures that the key P saves, as NAME-0001.png and so on.
     #[arg(short, long, default_value = ".", value_name = "DIR")]
     pub out: PathBuf,
-    /// Cameras of a finished scene: any pose file or scene folder; the first one is the initial
-    /// view. Default: cameras.json beside the scene, else a view of the whole.
-    #[arg(long, value_name = "SCENE")]
+    /// GPU that draws: gpu, auto, or a part of its name.
+    ///
+    /// `gpu` takes any, `auto` none that a program imitates.
+    #[arg(long, default_value = "gpu", value_name = "NAME")]
+    pub device: String,
+    /// Cameras of a finished scene: a pose file of any kind, or a scene folder.
+    ///
+    /// The first one is the initial view. Default: cameras.json beside the scene, else a view of the
+    /// whole.
+    #[arg(long, value_name = "SCENE", help_heading = PICTURES)]
     pub cameras: Option<PathBuf>,
-    /// Level of detail by the distance; L switches it in the window.
-    #[arg(long, value_enum, default_value_t = LevelsArg::Auto)]
+    /// Draw this many pictures and quit.
+    #[arg(
+        long,
+        value_name = "N",
+        value_parser = values::frames,
+        hide_short_help = true,
+        help_heading = PICTURES
+    )]
+    pub frames: Option<usize>,
+    /// Save the last of --frames (PNG).
+    #[arg(
+        long,
+        value_name = "FILE",
+        requires = "frames",
+        hide_short_help = true,
+        help_heading = PICTURES
+    )]
+    pub save: Option<PathBuf>,
+    /// Fewer splats where they are far away, or all; the key L switches.
+    #[arg(long, value_enum, default_value_t = LevelsArg::Auto, help_heading = PICTURES)]
     pub levels: LevelsArg,
-    /// Options of the reconstruction.
-    #[command(flatten)]
-    pub source: SourceArgs,
-    /// Rules of the rasterizer. Default: the model's own; for scene files those that `run` wrote
-    /// into them (.ply, .glb), else `standard`.
-    #[arg(long, value_enum)]
+    /// Rules by which splats are drawn.
+    ///
+    /// Default: those of the network; for a scene file what `run` wrote into it (.ply, .glb), else
+    /// `standard`.
+    #[arg(long, value_enum, hide_short_help = true, help_heading = PICTURES)]
     pub convention: Option<ConventionArg>,
-    /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
-    /// colour, or black); for scene files the one that `run` wrote into them, else black.
+    /// Colour behind the scene: red, green and blue from 0 to 1.
+    ///
+    /// Default: for photographs what the network was trained with (their mean colour, or black);
+    /// for a scene file what `run` wrote into it, else black.
     #[arg(
         long,
         value_parser = values::colour,
         allow_hyphen_values = true,
-        value_name = "R,G,B"
+        value_name = "R,G,B",
+        hide_short_help = true,
+        help_heading = PICTURES
     )]
     pub background: Option<[f32; 3]>,
+    /// Options of the reconstruction.
+    #[command(flatten)]
+    pub source: SourceArgs,
+    /// Size of the window in pixels: 1280x960, or N for NxN.
+    ///
+    /// Default: that of the first camera's picture, at most 1280x960.
+    #[arg(
+        long,
+        value_name = "N | WxH",
+        value_parser = values::size,
+        display_order = 0,
+        help_heading = SIZE
+    )]
+    pub size: Option<(usize, usize)>,
 }
 
 impl ViewArgs {
@@ -109,11 +139,13 @@ impl ViewArgs {
             (source.weights.is_some(), "--weights"),
             (source.seed.is_some(), "--seed"),
             (source.far.is_some(), "--far"),
-            (source.quality.is_some(), "--quality"),
+            (source.quality != QualityArg::Normal, "--quality"),
+            (source.input_size.is_some(), "--input-size"),
+            (source.gaussians.is_some(), "--gaussians"),
             (source.crop != CropShapeArg::Whole, "--crop"),
             (source.detail != DetailArg::Photo, "--detail"),
-            (source.fit != FitOptions::default().steps, "--fit"),
-            (source.refine != Refine::Auto, "--refine"),
+            (source.fit.is_some(), "--fit"),
+            (source.refine.is_some(), "--refine"),
             (source.model.backbone.is_some(), "--backbone"),
             (source.model.preset.is_some(), "--preset"),
             (source.model.config.is_some(), "--config"),

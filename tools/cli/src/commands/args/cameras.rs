@@ -1,0 +1,90 @@
+//! Arguments about the cameras of photographs that come without a pose file.
+
+use super::groups::CAMERAS;
+use crate::commands::values;
+use clap::{Args, ValueEnum};
+
+/// Cameras of photographs that come without a pose file.
+///
+/// Without --move and --pose-b the poses are estimated. Without --fov and --intrinsics the focal
+/// length comes from EXIF, else it is estimated too. With a pose of the second of two photographs,
+/// the first camera is the world unless --pose-a is given.
+#[derive(Clone, Debug, Args)]
+pub struct PairArgs {
+    /// Angle of view across, degrees, where EXIF does not tell it.
+    ///
+    /// It holds for all photographs. Without it and without EXIF the focal length is estimated, which two photographs alone often
+    /// do badly.
+    #[arg(
+        long,
+        value_name = "DEG",
+        conflicts_with = "intrinsics",
+        allow_negative_numbers = true,
+        value_parser = values::fov,
+        help_heading = CAMERAS
+    )]
+    pub fov: Option<f32>,
+    /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
+    #[arg(long, value_name = "K", hide_short_help = true, help_heading = CAMERAS)]
+    pub intrinsics: Option<String>,
+    /// Position of the second of two cameras as seen from the first: right, down, forward.
+    ///
+    /// Its unit becomes that of the scene.
+    #[arg(
+        long = "move",
+        value_parser = values::triple,
+        allow_hyphen_values = true,
+        value_name = "X,Y,Z",
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
+    pub translation: Option<[f32; 3]>,
+    /// Rotation of the second of two cameras against the first: degrees about x, then y, then z.
+    #[arg(
+        long,
+        value_parser = values::triple,
+        allow_hyphen_values = true,
+        value_name = "RX,RY,RZ",
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
+    pub turn: Option<[f32; 3]>,
+    /// Pose matrix of the first photograph: 12 or 16 numbers, row by row.
+    #[arg(
+        long,
+        allow_hyphen_values = true,
+        value_name = "M",
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
+    pub pose_a: Option<String>,
+    /// Pose matrix of the second photograph: 12 or 16 numbers, row by row.
+    #[arg(
+        long,
+        allow_hyphen_values = true,
+        value_name = "M",
+        conflicts_with_all = ["translation", "turn"],
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
+    pub pose_b: Option<String>,
+    /// Axes and direction of --pose-a and --pose-b, or of a scene's poses.txt.
+    ///
+    /// Default: opencv-c2w.
+    #[arg(long, value_enum, hide_short_help = true, help_heading = CAMERAS)]
+    pub pose_convention: Option<PoseConventionArg>,
+    /// Accept doubtful cameras and truncated JPEG files.
+    #[arg(long, help_heading = CAMERAS)]
+    pub force: bool,
+}
+
+/// Axes and direction of a pose matrix.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PoseConventionArg {
+    /// Camera-to-world, x right, y down, z forward.
+    OpencvC2w,
+    /// World-to-camera, x right, y down, z forward.
+    OpencvW2c,
+    /// Camera-to-world, x right, y up, z backward (NeRF, Blender).
+    OpenglC2w,
+}

@@ -1,0 +1,58 @@
+//! Arguments about scene files.
+
+use crate::commands::values;
+use clap::{Args, ValueEnum};
+
+/// Formats of the reconstructed scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SceneFormatArg {
+    /// The layout that nearly all viewers of splats read, with colours that change with the view.
+    Ply,
+    /// glTF, with the extension KHR_gaussian_splatting.
+    Glb,
+    /// Small and simple: 32 bytes a splat, one colour for all views.
+    Splat,
+    /// Compressed: Niantic's format, version 3.
+    Spz,
+    /// One page that shows the scene in any browser, offline too.
+    Html,
+}
+
+impl SceneFormatArg {
+    /// Name of the file in the output folder of `run`.
+    pub fn file_name(self) -> &'static str {
+        match self {
+            Self::Ply => "scene.ply",
+            Self::Glb => "scene.glb",
+            Self::Splat => "scene.splat",
+            Self::Spz => "scene.spz",
+            Self::Html => "scene.html",
+        }
+    }
+}
+
+/// Content of a scene file.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct ContentArgs {
+    /// How finely colours may change with the view: degree of the spherical harmonics, 0 to 3.
+    ///
+    /// 0 gives a splat one colour for all views and the smallest file. Default: 3, which viewers
+    /// expect. A .ply holds 0, 9, 24 or 45 values `f_rest` accordingly.
+    #[arg(
+        long,
+        value_name = "0…3",
+        value_parser = values::file_sh_degree,
+        hide_short_help = true
+    )]
+    pub sh: Option<usize>,
+    /// Leave out splats that are more transparent than this: 0 keeps all, 1 is opaque.
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "ALPHA",
+        allow_negative_numbers = true,
+        value_parser = values::opacity,
+        hide_short_help = true
+    )]
+    pub min_opacity: f32,
+}

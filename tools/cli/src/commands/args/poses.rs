@@ -1,0 +1,30 @@
+//! Arguments of `poses`.
+
+use crate::commands::values;
+use clap::Args;
+use std::path::PathBuf;
+
+/// Arguments of `poses`.
+#[derive(Debug, Args)]
+pub struct PosesArgs {
+    /// Photographs of one scene in any order, or a folder of them.
+    #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR")]
+    pub input: Vec<PathBuf>,
+    /// A .json file for the cameras, or a folder for cameras.json and COLMAP's model.
+    ///
+    /// The folder gets cameras.json, and COLMAP's text model in sparse/0.
+    #[arg(short, long, default_value = "poses", value_name = "FILE | DIR")]
+    pub out: PathBuf,
+    /// Angle of view across, degrees, where EXIF does not tell it.
+    ///
+    /// It holds for all photographs. Without it and without EXIF the focal length is estimated, which two photographs alone often
+    /// do badly.
+    #[arg(long, value_name = "DEG", conflicts_with = "intrinsics", value_parser = values::fov)]
+    pub fov: Option<f32>,
+    /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
+    #[arg(long, value_name = "K")]
+    pub intrinsics: Option<String>,
+    /// Accept doubtful cameras and truncated JPEG files.
+    #[arg(long)]
+    pub force: bool,
+}

@@ -1,0 +1,140 @@
+//! Arguments about the pictures that are drawn.
+
+use super::groups::PICTURES;
+use crate::commands::frames::Loop;
+use crate::commands::values;
+use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+
+/// Number of views of a path that is asked for.
+pub const PATH_FRAMES: usize = 30;
+
+/// The rules of a rasterizer.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum ConventionArg {
+    /// Those of 3D Gaussian Splatting, which viewers follow.
+    Standard,
+    /// Those that MVSplat's published weights were trained with.
+    Mvsplat,
+}
+
+impl From<ConventionArg> for subsplat_kernels::layout::Convention {
+    fn from(arg: ConventionArg) -> Self {
+        match arg {
+            ConventionArg::Standard => Self::Standard,
+            ConventionArg::Mvsplat => Self::Mvsplat,
+        }
+    }
+}
+
+/// The picture whose pixels are the unit of the low-pass.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum LowpassArg {
+    /// The picture that is drawn, as viewers do it.
+    Target,
+    /// The smaller picture that the network reads.
+    Input,
+}
+
+/// Cameras to render.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PathArg {
+    /// Single views: those of --target; else photographs that the scene was not made from, or the
+    /// cameras of a finished scene.
+    Targets,
+    /// A way from the first photograph's camera to the last.
+    Interpolate,
+    /// A circle around the middle of the cameras.
+    Orbit,
+    /// Two turns whose width and distance change.
+    Spiral,
+    /// Towards the scene and back.
+    Dolly,
+}
+
+impl PathArg {
+    /// The closed path around the cameras that this is, if it is one.
+    pub fn closed(self) -> Option<Loop> {
+        match self {
+            Self::Targets | Self::Interpolate => None,
+            Self::Orbit => Some(Loop::Orbit),
+            Self::Spiral => Some(Loop::Spiral),
+            Self::Dolly => Some(Loop::Dolly),
+        }
+    }
+}
+
+/// Length, radius and animation of a path.
+#[derive(Debug, Args)]
+pub struct MotionArgs {
+    /// Number of views of a --path.
+    ///
+    /// Default: 30; 3 for `run` without --path and without photographs to compare with.
+    #[arg(long, value_name = "N", value_parser = values::frames, help_heading = PICTURES)]
+    pub frames: Option<usize>,
+    /// Radius of --path orbit, spiral and dolly, in the unit of the cameras' positions.
+    ///
+    /// Default: near points move against far ones by 6 % of the picture's width, or half the
+    /// distance between the cameras where that is more.
+    #[arg(
+        long,
+        value_name = "R",
+        allow_negative_numbers = true,
+        value_parser = values::positive,
+        hide_short_help = true,
+        help_heading = PICTURES
+    )]
+    pub orbit_radius: Option<f32>,
+    /// The views as an animation: .gif, .webp, .mp4 or .webm.
+    ///
+    /// .gif and .webp need no other program; .mp4 and .webm need ffmpeg.
+    #[arg(long, value_name = "FILE", help_heading = PICTURES)]
+    pub video: Option<PathBuf>,
+    /// Views a second in --video.
+    #[arg(
+        long,
+        default_value_t = 25,
+        value_name = "N",
+        value_parser = values::rate,
+        hide_short_help = true,
+        help_heading = PICTURES
+    )]
+    pub fps: u32,
+}
+
+/// Rendering options.
+#[derive(Debug, Args)]
+pub struct RenderingArgs {
+    /// Processor: cpu, auto, gpu, or a part of a GPU's name.
+    ///
+    /// It draws the pictures. With `run` it does the largest parts of the reconstruction too. `auto` takes a GPU but no
+    /// program that imitates one, `gpu` takes either. Where the GPU fails, the CPU does the work,
+    /// with a warning.
+    #[arg(long, default_value = "cpu", value_name = "NAME")]
+    pub device: String,
+    /// Colour behind the scene: red, green and blue from 0 to 1.
+    ///
+    /// Default: for photographs what the network was trained with (their mean colour, or black);
+    /// for a scene file what `run` wrote into it, else black.
+    #[arg(
+        long,
+        value_parser = values::colour,
+        allow_hyphen_values = true,
+        value_name = "R,G,B",
+        hide_short_help = true,
+        help_heading = PICTURES
+    )]
+    pub background: Option<[f32; 3]>,
+    /// Rules by which splats are drawn.
+    ///
+    /// Default: those of the network; for a scene file what `run` wrote into it (.ply, .glb), else
+    /// `standard`.
+    #[arg(long, value_enum, hide_short_help = true, help_heading = PICTURES)]
+    pub convention: Option<ConventionArg>,
+    /// The picture whose pixels bound how small a splat is drawn.
+    ///
+    /// A splat smaller than a pixel would flicker. It is therefore drawn blurred by 0.3 square
+    /// pixels, of the picture that is drawn or of the smaller one that the network reads.
+    #[arg(long, value_enum, hide_short_help = true, help_heading = PICTURES)]
+    pub lowpass_ref: Option<LowpassArg>,
+}

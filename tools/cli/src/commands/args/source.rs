@@ -1,0 +1,326 @@
+//! Arguments of a reconstruction from photographs: of `run` and `view`.
+
+use super::cameras::PairArgs;
+use super::groups::{CAMERAS, NETWORK, QUALITY, SIZE};
+use crate::commands::values;
+use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+use subsplat::{Density, InputSize, Quality, Refine, TargetSize};
+
+/// Options of a reconstruction: of `run` and `view`.
+#[derive(Clone, Debug, Args)]
+pub struct SourceArgs {
+    /// Photographs to make the scene from: names or numbers.
+    ///
+    /// Names are those of the files; numbers count from 0. Default: up to five photographs without cameras are all taken. Of more, and of a scene with
+    /// cameras, those that its protocol.json names, else the two whose views overlap best.
+    #[arg(long, value_delimiter = ',', value_name = "I,J,…", help_heading = CAMERAS)]
+    pub context: Vec<String>,
+    /// Cameras of photographs without a pose file.
+    #[command(flatten)]
+    pub pair: PairArgs,
+    /// Correct given cameras that are nearly right.
+    ///
+    /// A headset gives such cameras. They are adjusted by points that the photographs share. Cameras that agree with the
+    /// photographs stay.
+    #[arg(long, help_heading = CAMERAS)]
+    pub adjust_poses: bool,
+    /// Do not compare the photographs before the reconstruction.
+    ///
+    /// The comparison finds cameras that do not fit, photographs of different exposure, and how near
+    /// and far the scene lies.
+    #[arg(long, hide_short_help = true, help_heading = CAMERAS)]
+    pub no_check: bool,
+    /// Nearest distance at which the scene may lie, in the unit of the cameras' positions.
+    ///
+    /// Default: what the pose file says; else found from the photographs. Of a finished scene in
+    /// `view`: nearer splats are not drawn.
+    #[arg(
+        long,
+        allow_negative_numbers = true,
+        value_parser = values::positive,
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
+    pub near: Option<f32>,
+    /// Farthest distance at which the scene may lie, in the same unit.
+    #[arg(
+        long,
+        allow_negative_numbers = true,
+        value_parser = values::positive,
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
+    pub far: Option<f32>,
+    /// Enlargement over what the network reads, 1 to 8.
+    ///
+    /// It is the ratio of the sides. The network reads the photographs small, as --quality says. Each pixel that it reads becomes
+    /// R x R splats: 4 for 2, 16 for 4. A number between two whole ones has the splats of the next
+    /// whole one. Default: what the weights were made for, else 2.
+    #[arg(long, value_name = "R", value_parser = values::upscale, help_heading = SIZE)]
+    pub upscale: Option<f32>,
+    /// Part of the photographs to use.
+    #[arg(long, value_enum, default_value = "whole", help_heading = SIZE)]
+    pub crop: CropShapeArg,
+    /// Time against sharpness.
+    ///
+    /// One word for four numbers: --input-size, --gaussians, --fit and --refine. Each of these flags
+    /// overrides its part. The number of pixels that the network reads is printed.
+    #[arg(long, value_enum, default_value = "normal", value_name = "LEVEL", help_heading = QUALITY)]
+    pub quality: QualityArg,
+    /// Most splats (3D Gaussians): auto, 200000, 50% or 3/px.
+    ///
+    /// Even surfaces keep one splat for each pixel that the network reads, and what has detail gets
+    /// the rest. A share is one of all that --upscale would give, and 3/px gives every pixel three.
+    /// auto: all of two photographs; more photographs share those of two and a half.
+    #[arg(
+        long,
+        value_name = "N",
+        value_parser = values::density,
+        help_heading = QUALITY
+    )]
+    pub gaussians: Option<Density>,
+    /// Pixels that the network reads of each photograph: N, or WxH.
+    ///
+    /// N: as many as a square of side N has, in the shape of the photographs; with `--crop square`
+    /// that square. Twice the side takes about four times the time and three times the memory.
+    #[arg(
+        long,
+        value_name = "N | WxH",
+        value_parser = values::input_size,
+        hide_short_help = true,
+        help_heading = QUALITY
+    )]
+    pub input_size: Option<InputSizeArg>,
+    /// Steps that match sizes, opacities and colours of the splats to the photographs.
+    ///
+    /// The network's splats look blurred. Each step compares pictures of them with the photographs,
+    /// and changes all splats a little, but not their places. 0 leaves them as the network made
+    /// them, and leaves out --refine too unless it names a number. All levels of --quality take 4.
+    #[arg(long, value_name = "STEPS", hide_short_help = true, help_heading = QUALITY)]
+    pub fit: Option<usize>,
+    /// Steps that move and reshape the splats so that new views become sharper.
+    ///
+    /// They follow those of --fit. Each draws one photograph from the splats and changes the splats to
+    /// come closer to it. `off`; a number of steps; or a time, such as `20s`. `auto`: eight steps a
+    /// photograph, 64 at most, and none for more than 1.5 million splats. New views are judged by
+    /// photographs that are drawn from the splats of the others: the steps end where these no longer
+    /// gain.
+    #[arg(
+        long,
+        value_name = "auto | off | STEPS | SECONDSs",
+        value_parser = values::refine,
+        hide_short_help = true,
+        help_heading = QUALITY
+    )]
+    pub refine: Option<Refine>,
+    /// Where fine texture comes from.
+    #[arg(
+        long,
+        value_enum,
+        default_value = "photo",
+        hide_short_help = true,
+        help_heading = QUALITY
+    )]
+    pub detail: DetailArg,
+    /// Weights of the network (.safetensors).
+    ///
+    /// Default: the small network's, which are part of the program.
+    #[arg(long, value_name = "FILE", hide_short_help = true, help_heading = NETWORK)]
+    pub weights: Option<PathBuf>,
+    /// Random weights of this seed instead: an untrained network, for tests.
+    #[arg(
+        long,
+        value_name = "N",
+        conflicts_with = "weights",
+        hide_short_help = true,
+        help_heading = NETWORK
+    )]
+    pub seed: Option<u64>,
+    /// The model.
+    #[command(flatten)]
+    pub model: ModelArgs,
+}
+
+impl SourceArgs {
+    /// Side of the children's grid that --upscale names.
+    pub fn children_side(&self) -> Option<usize> {
+        self.upscale.map(|r| r.ceil() as usize)
+    }
+
+    /// Size of the target pictures that --upscale names.
+    pub fn target_size(&self) -> TargetSize {
+        match self.upscale {
+            Some(r) if r.fract() > 0.0 => TargetSize::Times(r),
+            _ => TargetSize::Upscaled,
+        }
+    }
+
+    /// Size of the network's input: --input-size with --crop, else that of --quality.
+    pub fn input_size(&self) -> InputSize {
+        match self.input_size {
+            None => Quality::from(self.quality).settings().input_size,
+            Some(InputSizeArg::Sides(width, height)) => InputSize::exact(width, height),
+            Some(InputSizeArg::Side(side)) if self.crop == CropShapeArg::Square => {
+                InputSize::exact(side, side)
+            }
+            Some(InputSizeArg::Side(side)) => InputSize::Area(side * side),
+        }
+    }
+
+    /// Number of Gaussians: --gaussians, else that of --quality.
+    pub fn density(&self) -> Density {
+        self.gaussians.unwrap_or_else(|| Quality::from(self.quality).settings().density)
+    }
+}
+
+/// Quality by one word.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum QualityArg {
+    /// A draft, in a third of the time: 192 x 192 pixels are read, at most 150,000 splats, half of
+    /// the steps of --refine.
+    Fast,
+    /// 256 x 256 pixels are read, and --gaussians and --refine are `auto`.
+    Normal,
+    /// Up to 512 x 512 pixels are read, fewer where the photographs or the memory are smaller, with at
+    /// most 1.5 million splats: twice the time of normal, and 1.3 GiB for two photographs. Sharper where
+    /// the photographs overlap by 90 % or more; with less overlap, new views become no better.
+    High,
+    /// As high, with twice the steps of --refine: three times the time of normal. Closest to the
+    /// photographs; new views gain little.
+    Best,
+}
+
+impl QualityArg {
+    /// The word on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fast => "fast",
+            Self::Normal => "normal",
+            Self::High => "high",
+            Self::Best => "best",
+        }
+    }
+}
+
+impl From<QualityArg> for Quality {
+    fn from(arg: QualityArg) -> Self {
+        match arg {
+            QualityArg::Fast => Self::Fast,
+            QualityArg::Normal => Self::Normal,
+            QualityArg::High => Self::High,
+            QualityArg::Best => Self::Best,
+        }
+    }
+}
+
+/// Size of the network's input.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum InputSizeArg {
+    /// Side of the square of the same area, px.
+    Side(usize),
+    /// Width and height, px.
+    Sides(usize, usize),
+}
+
+/// Part of the photographs that the network reads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum CropShapeArg {
+    /// All of it; rounding of the sides may cut a few percent at the edges.
+    Whole,
+    /// The square in the middle.
+    Square,
+}
+
+/// Source of colour detail.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum DetailArg {
+    /// From the network alone, which sees no more than what it reads: blurred.
+    Off,
+    /// From the photographs too, where they have more pixels than the network reads.
+    Photo,
+}
+
+/// The model, where the weights do not state it.
+#[derive(Clone, Debug, Args)]
+pub struct ModelArgs {
+    /// Network that estimates distances: MVSplat's, or this project's small one.
+    ///
+    /// Default: that of the weights, and `re10k` for a bare MVSplat checkpoint. `re10k` without
+    /// weights is untrained.
+    #[arg(long, value_enum, hide_short_help = true, help_heading = NETWORK)]
+    pub backbone: Option<BackboneArg>,
+    /// Form of the equations that divide a splat into smaller ones.
+    ///
+    /// Default: that of the weights, and `tuned` for weights that do not divide splats.
+    #[arg(long, value_enum, hide_short_help = true, help_heading = NETWORK)]
+    pub preset: Option<PresetArg>,
+    /// A whole configuration of the network (JSON) instead of the two above.
+    #[arg(
+        long,
+        value_name = "FILE",
+        conflicts_with_all = ["backbone", "preset"],
+        hide_short_help = true,
+        help_heading = NETWORK
+    )]
+    pub config: Option<PathBuf>,
+}
+
+/// The network that predicts the primary Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BackboneArg {
+    /// MVSplat (12 M parameters).
+    Re10k,
+    /// This project's own light network.
+    Small,
+}
+
+/// Form of the modules that SubSplat adds to the backbone.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum PresetArg {
+    /// The paper's equations as written.
+    Paper,
+    /// The same with the corrections that ARCHITECTURE.md lists.
+    Tuned,
+}
+
+impl From<PresetArg> for subsplat::network::config::Preset {
+    fn from(arg: PresetArg) -> Self {
+        match arg {
+            PresetArg::Paper => Self::Paper,
+            PresetArg::Tuned => Self::Tuned,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        source: SourceArgs,
+    }
+
+    #[test]
+    fn single_flags_override_the_quality() {
+        let source = |flags: &str| Line::parse_from(flags.split(' ')).source;
+        let plain = source("run");
+        assert_eq!(plain.input_size(), InputSize::default());
+        assert_eq!(plain.density(), Density::default());
+        let best = source("run --quality best");
+        let settings = Quality::Best.settings();
+        assert_eq!((best.input_size(), best.density()), (settings.input_size, settings.density));
+        let mixed = source("run --quality best --input-size 192 --gaussians 9");
+        assert_eq!(mixed.input_size(), InputSize::Area(192 * 192));
+        assert_eq!(mixed.density(), Density::Count(9));
+        let square = source("run --quality fast --input-size 192 --crop square");
+        assert_eq!(square.input_size(), InputSize::exact(192, 192));
+        assert_eq!(
+            source("run --input-size 64x32 --crop square").input_size(),
+            InputSize::exact(64, 32)
+        );
+    }
+}
