@@ -17,10 +17,10 @@ use anyhow::{Context, Result};
 use common::Bench;
 use serde_json::json;
 use std::time::Instant;
+use subsplat::cameras::estimation::Uncertain;
 use subsplat::cameras::estimation::{
     Confidence, PoseOptions, PosePhoto, PoseRefusal, estimate_poses,
 };
-use subsplat::estimate::Uncertain;
 use subsplat::scene::metrics::psnr;
 use subsplat::{Options, Photo, Reconstructor};
 use subsplat_kernels::camera::{Camera, Size};

@@ -91,8 +91,9 @@ pub use crate::network::config::{Config, ConfigError, Preset};
 pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use crate::reconstruct::{
-    Check, Density, DepthBounds, DepthRange, Detail, Error, InputSize, Options, Photo, Poses,
-    Prepared, Progress, Quality, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
+    Check, Density, DepthBounds, DepthRange, Detail, Error, EstimateOptions, EstimatedPhotos,
+    EstimatedScene, InputSize, KnownLens, LensSource, Options, Photo, Poses, Prepared, Progress,
+    Quality, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
     estimate_cameras, estimate_cameras_of_files,
 };
 pub use files::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};
@@ -102,7 +103,7 @@ pub use files::{
     Error as FileError, SaveOptions, SplatFormat, Up, encode_splats, load_splats, parse_splats,
     save_splats,
 };
-pub use finish::FitOptions;
+pub use finish::{FinishError, FitOptions, TargetView};
 pub use scene::navigation::Bounds;
 pub use scene::render::{Picture, Renderer, render};
 pub use scene::splats::{Splats, SplatsError};

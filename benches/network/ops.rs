@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use subsplat::network::model::layers;
 use subsplat::network::model::layers::Activation;
 use subsplat::network::ops::attention::attention;
-use subsplat::network::ops::join::join;
+use subsplat::network::ops::cat::cat_upsampled;
 use subsplat::network::ops::linear::linear_no_bias;
 use subsplat::network::ops::norm;
 
@@ -102,7 +102,7 @@ const CASES: [Case; 15] = [
     Case {
         name: "cat 2x32x256x256 twice",
         inputs: &[("x", &[2, 32, 256, 256]), ("y", &[2, 32, 256, 256])],
-        run: |t| join(&t["x"], &t["y"], 1),
+        run: |t| cat_upsampled(&t["x"], &t["y"], 1),
     },
 ];
 

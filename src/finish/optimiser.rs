@@ -506,8 +506,14 @@ mod tests {
         let alone = |i| Alone::new(row_of(&splats.rows, i), gain_of(&splats.gain, i), alpha(i));
         let mut alone: Vec<Alone> = (0..COUNT).map(alone).collect();
         let o = RefineOptions::default();
-        let rates = [[o.opacity_rate; 1].as_slice(), &[o.scale_rate; 3], &[o.colour_rate; 3]];
-        let rates = [rates.concat(), vec![o.mean_rate; 3], vec![o.rotation_rate; 4]].concat();
+        let rates = [
+            vec![o.opacity_rate],
+            vec![o.scale_rate; 3],
+            vec![o.colour_rate; 3],
+            vec![o.mean_rate; 3],
+            vec![o.rotation_rate; 4],
+        ]
+        .concat();
         for step in 1..=4 {
             let by_all = gradients(COUNT, 10 + step as u64);
             let by_other = gradients(OTHER.len(), 20 + step as u64);

@@ -335,7 +335,7 @@ impl Refine {
     pub(crate) fn time(self) -> Option<Duration> {
         match self {
             Self::Seconds(seconds) => Some(Duration::from_secs(seconds.into())),
-            Self::Auto | Self::Off | Self::Steps(_) => None,
+            Self::Auto | Self::Each(_) | Self::Off | Self::Steps(_) => None,
         }
     }
 

@@ -306,7 +306,7 @@ fn parts_of_the_small_backbone() {
     for (window, mean) in [(2, MeanOver::Window), (1, MeanOver::All)] {
         same_gradients!(gpu, "expectation", TOLERANCE, |x| {
             let [mean, mass] = x.expectation(window, mean)?;
-            Array::add(mean, &mass.affine(-7.0, 0.0)?)
+            Array::add(&mean, &mass.affine(-7.0, 0.0)?)
         });
     }
     let scores = noise(r, &[2, 13, 6, 8]);
@@ -317,7 +317,7 @@ fn parts_of_the_small_backbone() {
     let start = r.many(144, 0.01, 1.0);
     same_gradients!(gpu, "convex upsampling", TOLERANCE, |masks, index, confidence| {
         let [first, second] = masks.upsample_convex([index, confidence], &start)?;
-        Array::add(first, &second.affine(-3.0, 0.0)?)
+        Array::add(&first, &second.affine(-3.0, 0.0)?)
     });
     let (rgb, fine) = (noise(r, &[2, 3, 12, 16]), noise(r, &[2, 1, 12, 16]));
     let logit = noise(r, &[2, 1, 12, 16]);

@@ -3,10 +3,10 @@
 
 use glam::{Mat3, Mat4, Vec3};
 use std::sync::Arc;
+use subsplat::cameras::estimation::Uncertain;
 use subsplat::cameras::estimation::{
     Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError, PoseRefusal, estimate_poses,
 };
-use subsplat::estimate::Uncertain;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_lab::data::procedural::{Grade, Quality, Room, TextureBank};
 use subsplat_test_support::pose_errors::relative_errors;

@@ -34,8 +34,9 @@ impl CameraMeasures {
         Self {
             baseline: views.translation.length() as f32,
             rotation_deg: views.rotation_angle().to_degrees() as f32,
-            fov_deg: cameras
-                .map(|c| [c.intrinsics().fov_x().to_degrees(), c.intrinsics().fov_y().to_degrees()]),
+            fov_deg: cameras.map(|c| {
+                [c.intrinsics().fov_x().to_degrees(), c.intrinsics().fov_y().to_degrees()]
+            }),
             is_same_camera: a.abs_diff_eq(b, 1e-6),
         }
     }
@@ -129,7 +130,7 @@ fn measure_depths(
     chosen: &[Match],
 ) -> (DepthMeasures, Option<[f32; 2]>) {
     let intrinsics = work.cameras.each_ref().map(|c| c.intrinsics());
-        let [k_a, k_b] = intrinsics.each_ref();
+    let [k_a, k_b] = intrinsics.each_ref();
     let longer_side = work.images[1].width().max(work.images[1].height());
     let parallax_px = geometry::parallax(views, chosen, longer_side);
     // A third of the limit is the accuracy of a match, measured on good poses.

@@ -411,7 +411,7 @@ mod tests {
     fn the_kernels_of_a_raw_matching_have_as_many_planes() {
         let declared = format!("const PLANES: u32 = {PLANES}u;");
         for kernel in [&RAW_MATCHING_BLOCKS, &RAW_MATCHING_SCORES] {
-            assert!(kernel.source.plain.contains(&declared), "{}: {declared}", kernel.name);
+            assert!(kernel.source.text(false).contains(&declared), "{}: {declared}", kernel.name);
         }
     }
 }

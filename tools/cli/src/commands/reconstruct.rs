@@ -10,10 +10,10 @@ use std::borrow::Borrow;
 use subsplat::cameras::check::{PairReport, Verdict};
 use subsplat::files::scene::Scene;
 use subsplat::finish::FitReport;
+use subsplat::finish::RefineReport;
 use subsplat::network::config::Config;
 use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
-use subsplat::finish::RefineReport;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, InputSize, Options, Photo, Poses, Prepared, Quality,
     Reconstruction, Reconstructor, TargetSize,

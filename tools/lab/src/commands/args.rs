@@ -109,7 +109,7 @@ pub struct CompareArgs {
 /// Arguments of `train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// Configuration of the training: TOML or JSON (examples: tools/train).
+    /// Configuration of the training: TOML or JSON (examples: tools/lab/train).
     pub config: PathBuf,
     /// Folder of checkpoints, weights, logs and sheets. The training continues from a
     /// checkpoint in it.

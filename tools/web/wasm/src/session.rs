@@ -4,7 +4,7 @@ use crate::host;
 use serde_json::{Value, json};
 use std::ops::{ControlFlow, RangeInclusive};
 use std::path::Path;
-use subsplat::estimate::EstimateOptions;
+use subsplat::EstimateOptions;
 use subsplat::{
     Backend, Camera, DeviceChoice, FitOptions, LoadOptions, Options, Photo, Photograph,
     RasterOptions, Reconstructor, Refine, SaveOptions, SplatFormat, Splats, Warning, encode_splats,
