@@ -103,9 +103,10 @@ fn backward(bench: &mut Bench, name: &str, a: &Attention) -> Result<()> {
         let maps = Var::from_tensor(&a.maps)?;
         let query = Var::from_tensor(&a.packed_query()?)?;
         let points = Var::from_tensor(&a.points)?;
-        let y = match fused {
-            true => attention_gather(&maps, &query, &points, a.gather.clone())?,
-            false => composed(a, &maps, &query, &points)?,
+        let y = if fused {
+            attention_gather(&maps, &query, &points, a.gather.clone())?
+        } else {
+            composed(a, &maps, &query, &points)?
         };
         let grads = y.mul(&weights)?.sum_all()?.backward()?;
         let get = |v: &Var| grads.get(v).cloned().ok_or_else(|| anyhow!("no gradient"));

@@ -124,9 +124,10 @@ impl Case {
 
     fn run(&self) -> Result<Tensor> {
         let s = &self.sizes;
-        Ok(match self.volume() {
-            true => conv3d(&self.x, &self.w, Some(&self.b), s.padding[2])?,
-            false => conv2d(&self.x, &self.w, Some(&self.b), s.stride[2], s.padding[2])?,
+        Ok(if self.volume() {
+            conv3d(&self.x, &self.w, Some(&self.b), s.padding[2])?
+        } else {
+            conv2d(&self.x, &self.w, Some(&self.b), s.stride[2], s.padding[2])?
         })
     }
 
@@ -173,9 +174,10 @@ fn main() -> Result<()> {
             if !bench.selects(&name) {
                 continue;
             }
-            match backward {
-                true => self::backward(&mut bench, &name, &case)?,
-                false => self::forth(&mut bench, &name, &case, ort.as_mut())?,
+            if backward {
+                self::backward(&mut bench, &name, &case)?
+            } else {
+                self::forth(&mut bench, &name, &case, ort.as_mut())?
             }
         }
     }

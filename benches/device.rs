@@ -139,9 +139,10 @@ fn report(name: &str, config: &Config, args: &Args) -> Result<()> {
         sum.bytes as f64 / minimum as f64
     );
     let memory = gpu.peak_allocated_bytes() as f64 / 1048576.0;
-    match args.count {
-        true => println!("{memory:.0} MiB of device memory at most; nothing was executed"),
-        false => println!("{memory:.0} MiB of device memory at most, {seconds:.3} s here"),
+    if args.count {
+        println!("{memory:.0} MiB of device memory at most; nothing was executed")
+    } else {
+        println!("{memory:.0} MiB of device memory at most, {seconds:.3} s here")
     }
     for (class, flops, bytes) in CLASSES {
         let of = |w: &Work| {

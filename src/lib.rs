@@ -92,8 +92,8 @@ pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use crate::reconstruct::{
     Check, Density, DepthBounds, DepthRange, Detail, Error, EstimateOptions, EstimatedPhotos,
-    EstimatedScene, InputSize, KnownLens, LensSource, Options, Photo, Poses, Prepared, Progress,
-    Quality, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
+    EstimatedScene, InputSize, KnownLens, LensSource, Options, Photo, Photographs, Poses, Prepared,
+    Progress, Quality, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
     estimate_cameras, estimate_cameras_of_files,
 };
 pub use files::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};

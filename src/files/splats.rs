@@ -218,6 +218,25 @@ pub fn parse_splats(bytes: &[u8], name: impl AsRef<Path>) -> Result<(Splats, Vec
     Ok((decoded.splats, decoded.comments))
 }
 
+impl Splats {
+    /// Reads a splat file, as [`load_splats`] does.
+    ///
+    /// # Errors
+    /// Those of [`load_splats`].
+    pub fn load(path: impl AsRef<Path>) -> Result<Self> {
+        load_splats(path)
+    }
+
+    /// Writes a splat file in the format of its extension with the default options of
+    /// [`save_splats`].
+    ///
+    /// # Errors
+    /// Those of [`save_splats`].
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<SaveReport> {
+        save_splats(path, self, &SaveOptions::default())
+    }
+}
+
 /// Writes a splat file in the format of its extension, atomically.
 ///
 /// `.ply` and `.glb` are lossless (float) but for SH above the degree written; `.spz` and

@@ -138,9 +138,12 @@ pub fn write_tensors(
         out.write_all(&(header.len() as u64).to_le_bytes())?;
         out.write_all(&header)?;
         for (i, spec) in specs.iter().enumerate() {
-            let bytes = data(i).and_then(|bytes| match spec.bytes() == Some(bytes.len()) {
-                true => Ok(bytes),
-                false => Err(wrong_length(path, spec, bytes.len())),
+            let bytes = data(i).and_then(|bytes| {
+                if spec.bytes() == Some(bytes.len()) {
+                    Ok(bytes)
+                } else {
+                    Err(wrong_length(path, spec, bytes.len()))
+                }
             });
             match bytes {
                 Ok(bytes) => out.write_all(&bytes)?,

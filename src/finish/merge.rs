@@ -112,9 +112,10 @@ impl Moments {
         sorted.sort_by(f64::total_cmp);
         let area = footprint([sorted[1], sorted[2]], lowpass);
         let depth = self.weight / area.max(f64::MIN_POSITIVE);
-        let opacity = match lowpass > 0.0 {
-            true => (-(-depth).exp_m1()).max(DENSE_OPACITY * depth),
-            false => (-(-depth).exp_m1()).min(OPACITY_MAX),
+        let opacity = if lowpass > 0.0 {
+            (-(-depth).exp_m1()).max(DENSE_OPACITY * depth)
+        } else {
+            (-(-depth).exp_m1()).min(OPACITY_MAX)
         };
         row[MEAN_OFFSET..MEAN_OFFSET + 3].copy_from_slice(&self.mean.to_array().map(|v| v as f32));
         row[QUAT_OFFSET..QUAT_OFFSET + 4].copy_from_slice(&[q.w, q.x, q.y, q.z].map(|v| v as f32));

@@ -72,9 +72,10 @@ fn picture_shares(
     let pictures: Vec<Rgb> = cameras.iter().map(blank).collect();
     let views: Vec<TargetView<'_>> =
         cameras.iter().zip(&pictures).map(|(camera, image)| TargetView { camera, image }).collect();
-    let mut found = match views.is_empty() {
-        true => vec![1.0; splats.len()],
-        false => shares(splats, &views, raster, renderer),
+    let mut found = if views.is_empty() {
+        vec![1.0; splats.len()]
+    } else {
+        shares(splats, &views, raster, renderer)
     };
     found.par_iter_mut().enumerate().for_each(|(i, share)| {
         let mean = Vec3::from_array(splats.mean(i));

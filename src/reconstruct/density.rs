@@ -156,9 +156,10 @@ fn variances(input: &Cropped, grids: &[usize]) -> Vec<Vec<f32>> {
     let (w, h) = (input.input.width, input.input.height);
     let r = grids.last().copied().unwrap_or(1);
     let size = (w * r, h * r);
-    let picture = match (input.target.width, input.target.height) == size {
-        true => input.target.to_unit(),
-        false => resize(&input.target, size.0, size.1, Filter::Lanczos).to_unit(),
+    let picture = if (input.target.width, input.target.height) == size {
+        input.target.to_unit()
+    } else {
+        resize(&input.target, size.0, size.1, Filter::Lanczos).to_unit()
     };
     // Mean square of the cells' means. Cells nest, so differences are variances.
     let squares = |side: usize| -> Vec<f32> {

@@ -52,11 +52,12 @@ fn add(
     let mut sources = Vec::with_capacity(inputs.len());
     for (c, pixels) in inputs.iter().zip(&pixels) {
         let (w, h) = (c.target.width, c.target.height);
-        let photograph = match has_detail(c) {
-            true => Some(Photograph::new(pixels, w, h).ok_or_else(|| {
+        let photograph = if has_detail(c) {
+            Some(Photograph::new(pixels, w, h).ok_or_else(|| {
                 Error::argument("photograph", format!("{w}x{h} pixels"), pixels.len().to_string())
-            })?),
-            false => None,
+            })?)
+        } else {
+            None
         };
         sources.push(SourceView { photograph, camera: c.input_camera });
     }

@@ -17,9 +17,10 @@ use subsplat_kernels::layout::RasterOptions;
 /// The largest picture of `c` that is no enlargement of the photograph, with its camera: the
 /// target's size, else the input's.
 fn sharp_picture(c: &Cropped) -> (&Camera, &Rgb) {
-    match c.window.scale.min_element() < 1.0 {
-        true => (&c.input_camera, &c.input),
-        false => (&c.target_camera, &c.target),
+    if c.window.scale.min_element() < 1.0 {
+        (&c.input_camera, &c.input)
+    } else {
+        (&c.target_camera, &c.target)
     }
 }
 

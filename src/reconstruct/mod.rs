@@ -65,7 +65,7 @@ pub use estimate_cameras::{
 };
 pub use input_size::InputSize;
 pub use options::{Check, Detail, Options, Poses, Quality, QualitySettings, Refine, TargetSize};
-pub use photo::Photo;
+pub use photo::{Photo, Photographs};
 pub use poses::PoseError;
 pub use prepared::Prepared;
 pub use progress::{Progress, Stage, StageTime};

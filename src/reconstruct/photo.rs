@@ -2,6 +2,7 @@
 
 use super::{Error, Result};
 use crate::files::image::{LoadOptions, Rgb};
+use crate::files::photograph::Photograph;
 use crate::files::scene::{Frame, LoadedFrame};
 use crate::reconstruct::inputs::crop::{CropOptions, Cropped, crop};
 use std::sync::Arc;
@@ -88,6 +89,46 @@ impl Photo {
     /// Those of [`crop`].
     pub fn crop(&self, options: &CropOptions) -> Result<Cropped> {
         Ok(crop(&self.image, &self.camera, options)?)
+    }
+}
+
+/// Photographs of one place, with their cameras or without: the input of
+/// [`Reconstructor::run`](super::Reconstructor::run). Slices, arrays and vectors convert into it.
+#[derive(Debug)]
+pub enum Photographs<'a> {
+    /// Photographs with cameras.
+    WithCameras(&'a [Photo]),
+    /// Photographs whose cameras are estimated.
+    WithoutCameras(Vec<Photograph>),
+}
+
+impl<'a> From<&'a [Photo]> for Photographs<'a> {
+    fn from(photos: &'a [Photo]) -> Self {
+        Self::WithCameras(photos)
+    }
+}
+
+impl<'a> From<&'a Vec<Photo>> for Photographs<'a> {
+    fn from(photos: &'a Vec<Photo>) -> Self {
+        Self::WithCameras(photos)
+    }
+}
+
+impl<'a, const N: usize> From<&'a [Photo; N]> for Photographs<'a> {
+    fn from(photos: &'a [Photo; N]) -> Self {
+        Self::WithCameras(photos)
+    }
+}
+
+impl From<Vec<Photograph>> for Photographs<'_> {
+    fn from(photographs: Vec<Photograph>) -> Self {
+        Self::WithoutCameras(photographs)
+    }
+}
+
+impl<const N: usize> From<[Photograph; N]> for Photographs<'_> {
+    fn from(photographs: [Photograph; N]) -> Self {
+        Self::WithoutCameras(photographs.into())
     }
 }
 

@@ -209,9 +209,10 @@ impl Tracker {
                         // The receiver is gone after a cancellation only.
                         let _ = sender.send(done);
                     }
-                    match stop.load(Ordering::Relaxed) {
-                        true => candle_core::bail!("cancelled"),
-                        false => Ok(()),
+                    if stop.load(Ordering::Relaxed) {
+                        candle_core::bail!("cancelled")
+                    } else {
+                        Ok(())
                     }
                 };
                 *slot = Some(work(&checkpoint));
@@ -259,10 +260,7 @@ impl Tracker {
             Ok(())
         };
         let result = work(&checkpoint);
-        match cancelled.load(Ordering::Relaxed) {
-            true => Err(Error::Cancelled),
-            false => Ok(result?),
-        }
+        if cancelled.load(Ordering::Relaxed) { Err(Error::Cancelled) } else { Ok(result?) }
     }
 
     /// Ends the last stage, reports fraction 1 and returns the times.

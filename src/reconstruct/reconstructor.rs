@@ -3,9 +3,9 @@
 use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
-    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, Poses, Prepared,
-    Progress, Reconstruction, Refine, Result, Stage, check_pairs, check_refine, exposure,
-    is_mvsplat, poses,
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, EstimateOptions, Options, Photo,
+    Photographs, Poses, Prepared, Progress, Reconstruction, Refine, Result, Stage, check_pairs,
+    check_refine, estimate_cameras, exposure, is_mvsplat, poses,
 };
 use crate::network::config::{Config, Preset};
 use crate::network::model::subsplat::SubSplat;
@@ -125,12 +125,18 @@ impl Reconstructor {
         CropOptions::new(input_size, config.upscale, config.stride())
     }
 
-    /// Reconstructs the scene of two or more photographs.
+    /// Reconstructs the scene of two or more photographs, with cameras ([`Photo`]) or without
+    /// ([`Photograph`](crate::Photograph)): cameras that are missing are estimated from points that the
+    /// photographs share.
     ///
     /// # Errors
     /// Fewer than two photographs; options out of range; poses that [`Check::Refuse`] rejects;
-    /// an error of the network.
-    pub fn run(&self, photos: &[Photo], options: &Options) -> Result<Reconstruction> {
+    /// photographs that do not determine their cameras; an error of the network.
+    pub fn run<'a>(
+        &self,
+        photos: impl Into<Photographs<'a>>,
+        options: &Options,
+    ) -> Result<Reconstruction> {
         self.run_with(photos, options, &mut |_| ControlFlow::Continue(()))
     }
 
@@ -141,13 +147,20 @@ impl Reconstructor {
     ///
     /// # Errors
     /// Those of [`Reconstructor::run`]; [`Error::Cancelled`](super::Error::Cancelled).
-    pub fn run_with(
+    pub fn run_with<'a>(
         &self,
-        photos: &[Photo],
+        photos: impl Into<Photographs<'a>>,
         options: &Options,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Reconstruction> {
-        self.prepare_with(photos, options, progress)?.reconstruct_with(progress)
+        let prepared = match photos.into() {
+            Photographs::WithCameras(photos) => self.prepare_with(photos, options, progress)?,
+            Photographs::WithoutCameras(photographs) => {
+                let estimated = estimate_cameras(photographs, &EstimateOptions::default())?;
+                self.prepare_with(&estimated.photos, options, progress)?
+            }
+        };
+        prepared.reconstruct_with(progress)
     }
 
     /// Crops the photographs, checks their poses and determines the depth range. The result

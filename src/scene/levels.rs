@@ -251,9 +251,8 @@ impl Levels {
     /// # Errors
     /// `splats` or `selection` are not those of these levels, as far as their lengths tell.
     pub fn gather(&self, splats: &Splats, selection: &Selection) -> Result<Splats, LevelsError> {
-        let check = |what, expected: usize, got: usize| match expected == got {
-            true => Ok(()),
-            false => Err(LevelsError { what, expected, got }),
+        let check = |what, expected: usize, got: usize| {
+            if expected == got { Ok(()) } else { Err(LevelsError { what, expected, got }) }
         };
         check("Gaussians", self.len(), splats.len())?;
         check("SH coefficients", self.merged.sh_coefficients(), splats.sh_coefficients())?;

@@ -39,6 +39,13 @@ pub fn render(splats: &Splats, camera: &Camera, options: &RasterOptions) -> Pict
     render_with(&mut Rasterizer::new(), splats, camera, options)
 }
 
+impl Splats {
+    /// Renders the scene as seen by `camera` on the CPU, with the default [`RasterOptions`].
+    pub fn render(&self, camera: &Camera) -> Picture {
+        render(self, camera, &RasterOptions::default())
+    }
+}
+
 /// Renders as [`render`] does, with buffers that are reused from view to view.
 pub fn render_with(
     rasterizer: &mut Rasterizer,

@@ -191,9 +191,10 @@ fn peak_memory_at_256_by_256() {
         // The adapter's own sizes of bindings, and a pool of its own.
         let own = Gpu::open(&DeviceChoice::Gpu).unwrap().unwrap();
         let backend = Backend::from(own.clone());
-        let config = match mvsplat {
-            true => Config::re10k(Preset::Tuned, 2),
-            false => Weights::shipped(2).unwrap().config().unwrap().clone(),
+        let config = if mvsplat {
+            Config::re10k(Preset::Tuned, 2)
+        } else {
+            Weights::shipped(2).unwrap().config().unwrap().clone()
         };
         let network = SubSplat::new(&config, Weights::seeded(7).builder()).unwrap();
         let network = network.with_backend(&backend);

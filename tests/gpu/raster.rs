@@ -116,10 +116,8 @@ fn random_scenes_match_the_cpu() {
             });
             worst_seen = [worst_seen[0].max(found[0]), worst_seen[1].max(found[1])];
             // Needles whose covariance is six numbers have an f32 determinant.
-            let [colour, depth] = match scene.cov6.is_empty() {
-                true => [COLOUR, DEPTH],
-                false => [COLOUR_MVSPLAT, DEPTH_COV6],
-            };
+            let [colour, depth] =
+                if scene.cov6.is_empty() { [COLOUR, DEPTH] } else { [COLOUR_MVSPLAT, DEPTH_COV6] };
             assert!(found[0] < colour && found[1] < depth, "{kind:?} {variant}: {found:?}");
         }
     }

@@ -26,10 +26,8 @@ fn naive(g: &Gather, maps: &Tensor, query: &Tensor, points: &Tensor) -> Tensor {
                     let at = 2 * ((i * g.views + v) * g.points_width() + own);
                     let at = [points[at], points[at + 1]];
                     let inside = at.iter().all(|&r| r > 0.0 && r < 1.0);
-                    let value = match inside {
-                        true => grid_sample(&maps, g, l, v, at),
-                        false => vec![0.0; g.stride],
-                    };
+                    let value =
+                        if inside { grid_sample(&maps, g, l, v, at) } else { vec![0.0; g.stride] };
                     samples.push((inside, v, value));
                 }
             }

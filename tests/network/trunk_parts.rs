@@ -118,9 +118,10 @@ fn attributes_are_those_of_tensor_operations_and_so_is_their_gradient() -> Resul
                 opacities: part(10, 1)?,
                 sh: Tensor::zeros((41, 12), DType::F64, &Device::Cpu)?,
             };
-            let all = match fused {
-                true => embeddings.attributes(&chunk, &frames)?,
-                false => Tensor::cat(&attributes(&config, &chunk, &frames)?, 1)?,
+            let all = if fused {
+                embeddings.attributes(&chunk, &frames)?
+            } else {
+                Tensor::cat(&attributes(&config, &chunk, &frames)?, 1)?
             };
             let weight: Vec<f64> = (0..41 * 11).map(|i| (i as f64 * 0.61).cos()).collect();
             let weight = Tensor::from_vec(weight, (41, 11), &Device::Cpu)?;

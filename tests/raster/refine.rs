@@ -191,9 +191,10 @@ fn two_photographs_with_little_in_common_are_not_refined() {
         parts.rows.extend_from_slice(&copy.rows);
         parts.sh.extend_from_slice(&copy.sh);
         for (i, row) in parts.rows.chunks_mut(SPLAT_STRIDE).enumerate() {
-            let kept = match i * SPLAT_STRIDE < second {
-                true => i / SIDE < rows,
-                false => i / SIDE - SIDE >= SIDE - rows,
+            let kept = if i * SPLAT_STRIDE < second {
+                i / SIDE < rows
+            } else {
+                i / SIDE - SIDE >= SIDE - rows
             };
             if !kept {
                 row[OPACITY_OFFSET] = 1e-3;

@@ -357,10 +357,8 @@ fn projection() -> Result<()> {
             let mut rasterizer = Rasterizer::new();
             rasterizer.render(&slices, &camera, &options);
             for f in rasterizer.footprints() {
-                let (conic, opacity) = match f.visible() {
-                    true => (f.conic(), f.opacity()),
-                    false => ([0.0; 3], 0.0),
-                };
+                let (conic, opacity) =
+                    if f.visible() { (f.conic(), f.opacity()) } else { ([0.0; 3], 0.0) };
                 let edges = [f.x0, f.y0, f.x1, f.y1].map(|v| v as f32);
                 let mut put = |name, v: &[f32]| quads.entry(name).or_default()[form].extend(v);
                 put("means2d", &[f.u, f.v]);

@@ -12,7 +12,7 @@ mkdir -p "$target/instructions"
 gcc -O2 -Wall -Wextra -shared -fPIC -o "$plugin" tools/instructions/count.c
 for platform in x86_64 aarch64; do
     rustup target add --toolchain "$(rustup show active-toolchain | cut -d' ' -f1)" $platform-unknown-linux-gnu 2>/dev/null
-    cargo build --locked --release --quiet --manifest-path tests/kernels/Cargo.toml --features internals \
+    cargo build --locked --release --quiet -p subsplat-lab --no-default-features \
         --target $platform-unknown-linux-gnu --example one_kernel
 done
 

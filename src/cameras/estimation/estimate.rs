@@ -272,10 +272,8 @@ fn two(a: &PosePhoto, b: &PosePhoto, options: &PoseOptions) -> Result<PoseEstima
     let turned = [a, b].map(PosePhoto::with_rotated_features);
     let rotated = pair::estimate(&turned[0], &turned[1], true, options.seed);
     let better = supported(&rotated) > supported(&upright) + supported(&upright) / 2;
-    let (best, [first, second]) = match better {
-        true => (rotated, [&turned[0], &turned[1]]),
-        false => (upright, [a, b]),
-    };
+    let (best, [first, second]) =
+        if better { (rotated, [&turned[0], &turned[1]]) } else { (upright, [a, b]) };
     // Symmetric things in a mirrored photograph agree with a camera upside down behind a plane.
     if options.uncertain == Uncertain::Refuse
         && (supported(&best) < FEW_CONSISTENT || is_upside_down(&best))

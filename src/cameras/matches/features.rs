@@ -107,9 +107,10 @@ pub(crate) struct Octave {
 /// add a second copy of a feature with several strong gradient directions.
 pub(crate) fn detect(image: &GrayImage, max_features: usize, orientation: Orientation) -> Features {
     let doubled = image.width().max(image.height()) < DOUBLE_BELOW;
-    let (base, blur, unit) = match doubled {
-        true => (image.doubled(), 2.0 * SIGMA_CAMERA, 0.5),
-        false => (image.clone(), SIGMA_CAMERA, 1.0),
+    let (base, blur, unit) = if doubled {
+        (image.doubled(), 2.0 * SIGMA_CAMERA, 0.5)
+    } else {
+        (image.clone(), SIGMA_CAMERA, 1.0)
     };
     let octaves = pyramid(base, blur);
     let mut found: Vec<Feature> = octaves

@@ -132,9 +132,10 @@ impl<'a> Stream<'a> {
     fn short(&self, n: u64) -> Error {
         let position = self.position();
         let left = self.left();
-        let got = match self.limited {
-            true => format!("{left} up to the limit on the size of a pickle"),
-            false => format!("{left} (truncated, or a wrong length)"),
+        let got = if self.limited {
+            format!("{left} up to the limit on the size of a pickle")
+        } else {
+            format!("{left} (truncated, or a wrong length)")
         };
         Error::format(self.path, format!("{n} more bytes of pickle"), got)
             .at(format!(" at byte {position}"))

@@ -205,10 +205,8 @@ pub(crate) fn choose_sources(
                 score - OPPOSITE_SIDE * same
             };
             // The first of equal scores.
-            let best = (0..rest.len()).reduce(|a, b| match value(&rest[b]) > value(&rest[a]) {
-                true => b,
-                false => a,
-            });
+            let best = (0..rest.len())
+                .reduce(|a, b| if value(&rest[b]) > value(&rest[a]) { b } else { a });
             let (j, _, side) = rest.remove(best.unwrap_or(0));
             chosen.push((j, side));
         }

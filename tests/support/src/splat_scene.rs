@@ -58,9 +58,12 @@ pub fn scene(seed: u64, kind: Kind) -> Splats {
     }
     let sh = (0..kind.parents * d * 3).map(|_| r.within(-0.4, 0.4) as f32).collect();
     let gain = (0..n * kind.gain_channels)
-        .map(|i| match kind.gain_channels == 1 || i % 4 == 0 {
-            true => r.within(0.5, 1.5) as f32,
-            false => r.within(-0.1, 0.1) as f32,
+        .map(|i| {
+            if kind.gain_channels == 1 || i % 4 == 0 {
+                r.within(0.5, 1.5) as f32
+            } else {
+                r.within(-0.1, 0.1) as f32
+            }
         })
         .collect();
     Splats::new(rows, sh, gain, kind.degree, kind.basis).unwrap()

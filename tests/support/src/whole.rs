@@ -67,10 +67,7 @@ impl Shoot {
 
 /// MVSplat's or the small network with one of the presets.
 pub fn plain(mvsplat: bool, preset: Preset, upscale: usize) -> Config {
-    match mvsplat {
-        true => Config::re10k(preset, upscale),
-        false => Config::small(preset, upscale),
-    }
+    if mvsplat { Config::re10k(preset, upscale) } else { Config::small(preset, upscale) }
 }
 
 /// Fewer layers where a test needs no particular network: a third of the time.

@@ -205,12 +205,13 @@ mod large {
                 let before = self.remove(i);
                 new = Block { at: before.at, length: before.length + new.length, ..new };
             }
-            let out = match self.n == SLOTS {
-                true => self.oldest().map(|oldest| {
+            let out = if self.n == SLOTS {
+                self.oldest().map(|oldest| {
                     i -= usize::from(oldest < i);
                     self.remove(oldest)
-                }),
-                false => None,
+                })
+            } else {
+                None
             };
             self.blocks.copy_within(i..self.n, i + 1);
             self.blocks[i] = new;

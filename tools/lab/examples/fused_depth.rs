@@ -63,9 +63,10 @@ fn scene(
     let [near, far] = room.range;
     let options = Options::default().with_input_size(INPUT, INPUT);
     let options = options.with_depth_prior(DepthBounds::new(near, far, DepthSource::PoseFile));
-    let options = match refined {
-        true => options,
-        false => options.with_fit(FitOptions::off()).with_refine(Refine::Off),
+    let options = if refined {
+        options
+    } else {
+        options.with_fit(FitOptions::off()).with_refine(Refine::Off)
     };
     Ok(model.run(&photos, &options)?)
 }

@@ -255,9 +255,10 @@ const BLOCK: usize = 64;
 
 /// [`forward`] in single precision, faster where the presets' shape allows it.
 pub fn forward_f32(g: &Gather, maps: &[f32], query: &[f32], points: &[f32], out: &mut [f32]) {
-    match narrow::suits(g) {
-        true => narrow::forward(g, maps, query, points, out),
-        false => forward(g, maps, query, points, out),
+    if narrow::suits(g) {
+        narrow::forward(g, maps, query, points, out)
+    } else {
+        forward(g, maps, query, points, out)
     }
 }
 

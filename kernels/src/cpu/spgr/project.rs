@@ -281,9 +281,8 @@ impl Project<'_> {
             for lane in 0..count {
                 let f = |i: usize| tile[i][lane];
                 let whole = |i: usize| tile[i][lane].to_bits() & 0x007f_ffff;
-                self.out[at + lane * children + k] = match keeps[lane] > 0.0 {
-                    false => Footprint::default(),
-                    true => Footprint {
+                self.out[at + lane * children + k] = if keeps[lane] > 0.0 {
+                    Footprint {
                         u: f(0),
                         v: f(1),
                         sx: f(2),
@@ -298,7 +297,9 @@ impl Project<'_> {
                         y0: whole(13),
                         x1: whole(14),
                         y1: whole(15),
-                    },
+                    }
+                } else {
+                    Footprint::default()
                 };
             }
         }

@@ -79,12 +79,11 @@ impl AdapterCall {
     /// Refuses raw rows of another number of elements.
     fn check(&self, kernel: &'static str, raw: &Array) -> Result<(), GpuError> {
         let row = GEOMETRY + 3 * self.functions;
-        match raw.count() == self.pixels() * row && self.pixels() > 0 && self.per_pixel > 0 {
-            true => Ok(()),
-            false => {
-                let expected = format!("raw rows [{}, {row}], of at least one", self.pixels());
-                Err(misfit(kernel, expected, &raw.dims))
-            }
+        if raw.count() == self.pixels() * row && self.pixels() > 0 && self.per_pixel > 0 {
+            Ok(())
+        } else {
+            let expected = format!("raw rows [{}, {row}], of at least one", self.pixels());
+            Err(misfit(kernel, expected, &raw.dims))
         }
     }
 }

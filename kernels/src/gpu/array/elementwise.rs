@@ -372,9 +372,10 @@ impl Array {
     pub fn expanded(&self, dims: &[usize]) -> Result<Self, GpuError> {
         let fits = self.dims.len() == dims.len()
             && self.dims.iter().zip(dims).all(|(own, size)| own == size || *own == 1);
-        match fits {
-            true => self.gathered(dims, Walk::repeating(&self.dims)),
-            false => Err(misfit("expand", format!("{dims:?} or sizes of 1"), &self.dims)),
+        if fits {
+            self.gathered(dims, Walk::repeating(&self.dims))
+        } else {
+            Err(misfit("expand", format!("{dims:?} or sizes of 1"), &self.dims))
         }
     }
 

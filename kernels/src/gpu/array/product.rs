@@ -70,10 +70,8 @@ impl Array {
             return Err(refused());
         };
         let flat = size.len() == 2;
-        let per_axis = |value: usize, unused: usize| match flat {
-            true => [unused, value, value],
-            false => [value; 3],
-        };
+        let per_axis =
+            |value: usize, unused: usize| if flat { [unused, value, value] } else { [value; 3] };
         let (stride, padding) = (per_axis(call.stride, 1), per_axis(call.padding, 0));
         let inside = (0..3).all(|i| taps[i] > 0 && from[i] + 2 * padding[i] >= taps[i]);
         let fits = wc == c

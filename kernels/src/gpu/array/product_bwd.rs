@@ -65,12 +65,11 @@ impl Array {
         let spread = |(size, _): (&usize, &usize)| size + 2 * padding + 1 - side;
         let inside: Vec<usize> = size.iter().zip(to).map(spread).collect();
         let spread_dims = [&self.dims[..2], &inside[..]].concat();
-        let whole = match spread_dims == self.dims {
-            true => self.clone(),
-            false => {
-                let steps = [&[1, 1], &vec![stride; to.len()][..]].concat();
-                self.spread(&spread_dims, &steps, &vec![0; spread_dims.len()])?
-            }
+        let whole = if spread_dims == self.dims {
+            self.clone()
+        } else {
+            let steps = [&[1, 1], &vec![stride; to.len()][..]].concat();
+            self.spread(&spread_dims, &steps, &vec![0; spread_dims.len()])?
         };
         let taps: usize = kernel.iter().product();
         let mirrored: Vec<u32> = (0..taps as u32).rev().collect();
@@ -105,10 +104,8 @@ impl Array {
             return Err(refused());
         };
         let flat = size.len() == 2;
-        let per_axis = |value: usize, unused: usize| match flat {
-            true => [unused, value, value],
-            false => [value; 3],
-        };
+        let per_axis =
+            |value: usize, unused: usize| if flat { [unused, value, value] } else { [value; 3] };
         let terms = c * taps.iter().product::<usize>();
         let pixels: usize = to.iter().product();
         if dy.dims[..2] != [b, o] || dims[1] != c || pixels * terms == 0 {

@@ -32,9 +32,10 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     let all = splats.len();
     // cameras.json of `run` holds the views, the comment the first photograph.
     let own = camera_of_comments(&comments);
-    let beside = match html || args.gaussians.is_some() {
-        true => render::cameras_beside(args.cameras.as_deref(), &file)?,
-        false => None,
+    let beside = if html || args.gaussians.is_some() {
+        render::cameras_beside(args.cameras.as_deref(), &file)?
+    } else {
+        None
     };
     let beside: Option<Vec<Camera>> =
         beside.map(|all| all.into_iter().map(|(_, camera)| camera).collect());

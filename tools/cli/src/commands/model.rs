@@ -67,9 +67,10 @@ fn load_default(args: &ModelRequest) -> Result<Reconstructor> {
         return shipped(args);
     }
     let (config, seed) = (config(args, None)?, args.seed.unwrap_or(0));
-    let effect = match is_mvsplat(&config) {
-        true => "pictures will be noise",
-        false => "distances come from colours alone, and pictures will be coarse",
+    let effect = if is_mvsplat(&config) {
+        "pictures will be noise"
+    } else {
+        "distances come from colours alone, and pictures will be coarse"
     };
     print_warning(format!(
         "the network is untrained (random weights of seed {seed}): {effect}; --weights names trained ones"

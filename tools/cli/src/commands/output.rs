@@ -340,9 +340,10 @@ pub fn write_scene(
     let one = |format: &SceneFormatArg| {
         let path = out.join(format.file_name());
         let html = *format == SceneFormatArg::Html;
-        let saved = match html {
-            true => page.write(&path, options)?,
-            false => save_splats(&path, page.splats, options)?,
+        let saved = if html {
+            page.write(&path, options)?
+        } else {
+            save_splats(&path, page.splats, options)?
         };
         let mut value = serde_json::to_value(&saved)?;
         if html {

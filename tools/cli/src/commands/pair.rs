@@ -108,9 +108,10 @@ pub fn estimate(
         Some(text) => Some(KnownLens::Pixels(four(text)?)),
         None => request.fov.map(|fov| KnownLens::FovX(fov.to_radians())),
     };
-    let (truncated, uncertain) = match request.force {
-        true => (Truncated::Accept, Uncertain::Accept),
-        false => (Truncated::Refuse, Uncertain::Refuse),
+    let (truncated, uncertain) = if request.force {
+        (Truncated::Accept, Uncertain::Accept)
+    } else {
+        (Truncated::Refuse, Uncertain::Refuse)
     };
     let options = EstimateOptions {
         lens,

@@ -115,9 +115,10 @@ pub fn scene_file(path: &Path) -> Result<PathBuf> {
         return Ok(file);
     }
     let name = path.display();
-    let hint = match is_scene(path) || list_photographs(path).len() >= 2 {
-        true => format!("; it holds photographs: reconstruct them by `subsplat run {name}`"),
-        false => String::new(),
+    let hint = if is_scene(path) || list_photographs(path).len() >= 2 {
+        format!("; it holds photographs: reconstruct them by `subsplat run {name}`")
+    } else {
+        String::new()
     };
     bail!(
         "{name}: expected a scene file, or a folder with scene.ply as `subsplat run` writes it, \
@@ -232,9 +233,10 @@ fn named_cameras(
         )]);
     };
     let names: Vec<&str> = all.iter().map(|(n, _)| n.as_str()).collect();
-    let chosen = match args.target.is_empty() {
-        true => (0..all.len()).collect(),
-        false => frames::pick(&names, &args.target, "--target")?,
+    let chosen = if args.target.is_empty() {
+        (0..all.len()).collect()
+    } else {
+        frames::pick(&names, &args.target, "--target")?
     };
     let (names, cameras): (Vec<String>, Vec<Camera>) =
         chosen.into_iter().map(|i| all[i].clone()).unzip();

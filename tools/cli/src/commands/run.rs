@@ -238,9 +238,10 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
     if args.path != PathArg::Targets {
         return Ok(Vec::new());
     }
-    let chosen = match args.target.is_empty() {
-        false => frames::indices(&plan.scene, &args.target, "--target")?,
-        true => default_targets(&args.input[0], plan, size)?,
+    let chosen = if args.target.is_empty() {
+        default_targets(&args.input[0], plan, size)?
+    } else {
+        frames::indices(&plan.scene, &args.target, "--target")?
     };
     if chosen.is_empty() {
         print_line(format!(

@@ -202,9 +202,10 @@ impl Plan {
             wanted.len(),
             self.taken.len(),
             first(&self.missing),
-            match linear {
-                true => "--lpips-linear names the file of LPIPS' linear weights",
-                false => "--allow-missing writes the others",
+            if linear {
+                "--lpips-linear names the file of LPIPS' linear weights"
+            } else {
+                "--allow-missing writes the others"
             }
         );
     }

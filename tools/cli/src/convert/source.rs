@@ -70,10 +70,8 @@ enum Reader {
 impl Source {
     /// Opens a file; its content determines the format.
     pub fn open(path: &Path) -> Result<Self> {
-        let mut source = match is_safetensors(path)? {
-            true => Self::safetensors(path)?,
-            false => Self::torch(path)?,
-        };
+        let mut source =
+            if is_safetensors(path)? { Self::safetensors(path)? } else { Self::torch(path)? };
         (source.bytes, source.sha256) = hash(path)?;
         Ok(source)
     }

@@ -18,23 +18,6 @@ fn the_readme_quotes_the_program() {
     assert_eq!(quoted.unwrap(), program);
 }
 
-/// The README's second program is the documentation's example, which a doc test runs on
-/// temporary files.
-#[test]
-fn the_readme_quotes_the_documented_viewer() {
-    let readme = std::fs::read_to_string(root().join("README.md")).unwrap();
-    let quoted = readme.split("```rust\n").nth(2).and_then(|rest| rest.split("```").next());
-    let documentation = std::fs::read_to_string(root().join("src/lib.rs")).unwrap();
-    let quoted = quoted
-        .unwrap()
-        .replace("\"room.ply\".as_ref()", "room_ply")
-        .replace("\"view.png\".as_ref()", "view_png");
-    assert_eq!(quoted.lines().count(), 7);
-    for line in quoted.lines().filter(|line| !line.is_empty()) {
-        assert!(documentation.contains(&format!("//! {line}\n")), "{line}");
-    }
-}
-
 /// Runs the README's program in the current folder. The test below starts it as a process of
 /// its own, because a folder belongs to a whole process.
 #[test]

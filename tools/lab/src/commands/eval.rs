@@ -48,10 +48,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
         data.keep_part(part, parts).context("--shard")?;
     }
     let needed = methods(args, ratio.unwrap_or(UPSCALE))?.iter().any(Method::needs_model);
-    let model = match needed {
-        true => Some(progress.stage("model", |_| load(args, ratio))?),
-        false => None,
-    };
+    let model = if needed { Some(progress.stage("model", |_| load(args, ratio))?) } else { None };
     let own = model.as_ref().map(|m| m.config().upscale as f32);
     let upscale = ratio.or(own).unwrap_or(UPSCALE);
     let options = Options {
@@ -114,10 +111,8 @@ fn load(args: &EvalArgs, ratio: Option<f32>) -> Result<Reconstructor> {
 
 /// The methods of the arguments at `upscale`, checked: no name twice.
 fn methods(args: &EvalArgs, upscale: f32) -> Result<Vec<Method>> {
-    let mut all = match args.methods.is_empty() {
-        true => Options::new(upscale).methods,
-        false => args.methods.clone(),
-    };
+    let mut all =
+        if args.methods.is_empty() { Options::new(upscale).methods } else { args.methods.clone() };
     if args.detail == DetailArg::Photo && !all.contains(&Method::Detail) {
         let place = all.iter().position(|m| *m == Method::Subsplat).map_or(0, |i| i + 1);
         all.insert(place, Method::Detail);

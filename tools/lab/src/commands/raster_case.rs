@@ -134,9 +134,10 @@ impl Case {
     /// # Errors
     /// It has another shape.
     pub fn optional(&self, name: &str, shape: &[usize]) -> Result<Option<&[f32]>> {
-        match self.tensors.contains_key(name) {
-            true => array(&self.tensors, name, shape).map(Some),
-            false => Ok(None),
+        if self.tensors.contains_key(name) {
+            array(&self.tensors, name, shape).map(Some)
+        } else {
+            Ok(None)
         }
     }
 

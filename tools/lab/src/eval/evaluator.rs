@@ -48,9 +48,10 @@ impl Options {
     /// from the others at this `upscale`.
     pub fn new(upscale: f32) -> Self {
         use Method::{Backbone, Bilinear, Copy, Fit, Lowpass, Mean, Refine, Subsplat, Uniform};
-        let methods = match upscale > 1.0 {
-            false => vec![Subsplat, Fit, Refine, Backbone, Copy, Mean],
-            true => vec![Subsplat, Fit, Refine, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
+        let methods = if upscale > 1.0 {
+            vec![Subsplat, Fit, Refine, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean]
+        } else {
+            vec![Subsplat, Fit, Refine, Backbone, Copy, Mean]
         };
         Self {
             upscale,
@@ -157,9 +158,8 @@ impl Evaluator {
         }
         // `run` matches points in the whole photographs. Those of disturbed pictures are as given.
         let changed = self.options.disturbances.iter().any(|d| d.changes_pictures());
-        let photos = |inputs: &[Cropped]| match changed {
-            true => photos(inputs),
-            false => whole_photos(&whole, &given, inputs),
+        let photos = |inputs: &[Cropped]| {
+            if changed { photos(inputs) } else { whole_photos(&whole, &given, inputs) }
         };
         let Crops { inputs, targets, .. } = &mut crops;
         self.options.preparation.apply(&given, photos, inputs, &truth, targets)?;

@@ -514,9 +514,10 @@ impl TrainConfig {
         for size in sizes {
             let (r, fits) = (size.upscale, any || size.upscale == config.upscale);
             if !(1..=UPSCALE_MAX).contains(&r) || !fits {
-                let expected = match any {
-                    true => format!("an upscale of 1 to {UPSCALE_MAX}"),
-                    false => format!("the model's upscale, {}", config.upscale),
+                let expected = if any {
+                    format!("an upscale of 1 to {UPSCALE_MAX}")
+                } else {
+                    format!("the model's upscale, {}", config.upscale)
                 };
                 return Err(Error::value("data.sizes", expected, r));
             }

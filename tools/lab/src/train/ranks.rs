@@ -258,9 +258,10 @@ impl Exchange {
             wait.as_secs_f64(),
             path.display()
         );
-        let got = match other {
-            true => "those of another configuration, step or state of the weights",
-            false => "none: the process does not run, or does not see this folder",
+        let got = if other {
+            "those of another configuration, step or state of the weights"
+        } else {
+            "none: the process does not run, or does not see this folder"
         };
         Err(Error::value(format!("rank {owner} of {count}"), expected, got))
     }

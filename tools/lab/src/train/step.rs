@@ -548,9 +548,10 @@ impl Learner {
     }
 
     fn disparity_mean(&self) -> DisparityMean {
-        match self.config.loss.around_mode {
-            true => DisparityMean::AroundMode,
-            false => DisparityMean::AllCandidates,
+        if self.config.loss.around_mode {
+            DisparityMean::AroundMode
+        } else {
+            DisparityMean::AllCandidates
         }
     }
 

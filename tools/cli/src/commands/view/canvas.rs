@@ -62,10 +62,8 @@ fn configuration(
     })?;
     // Alpha is the scene's coverage of a pixel; the window itself is opaque.
     let opaque = wgpu::CompositeAlphaMode::Opaque;
-    let alpha_mode = match caps.alpha_modes.contains(&opaque) {
-        true => opaque,
-        false => wgpu::CompositeAlphaMode::Auto,
-    };
+    let alpha_mode =
+        if caps.alpha_modes.contains(&opaque) { opaque } else { wgpu::CompositeAlphaMode::Auto };
     Ok(wgpu::SurfaceConfiguration {
         usage: wgpu::TextureUsages::RENDER_ATTACHMENT
             | (caps.usages & wgpu::TextureUsages::COPY_SRC),

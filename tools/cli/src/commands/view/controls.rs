@@ -94,14 +94,11 @@ impl Controls {
     pub fn key(&mut self, key: KeyCode, state: ElementState, repeat: bool) -> Option<KeyAction> {
         let down = state.is_pressed();
         if let Some(step) = step(key) {
-            match down {
-                true => {
-                    self.held.insert(step);
-                    self.tapped.insert(step);
-                }
-                false => {
-                    self.held.remove(&step);
-                }
+            if down {
+                self.held.insert(step);
+                self.tapped.insert(step);
+            } else {
+                self.held.remove(&step);
             }
             return None;
         }

@@ -61,9 +61,10 @@ impl Published {
 
 /// Quotes a cell where necessary (RFC 4180).
 fn quoted(text: &str) -> String {
-    match text.contains([',', '"']) {
-        true => format!("\"{}\"", text.replace('"', "\"\"")),
-        false => text.to_owned(),
+    if text.contains([',', '"']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text.to_owned()
     }
 }
 
@@ -217,10 +218,7 @@ fn order_of(part: &Part) -> Option<String> {
     };
     let counts: Vec<usize> = (0..seeds).map(agree).collect();
     let total = pairs.len();
-    let verdict = match counts.iter().all(|c| *c == total) {
-        true => "confirmed",
-        false => "not confirmed",
-    };
+    let verdict = if counts.iter().all(|c| *c == total) { "confirmed" } else { "not confirmed" };
     let plural = if total == 1 { "" } else { "s" };
     let each: Vec<String> = counts.iter().map(|c| format!("{c} of {total}")).collect();
     let by_seed = if seeds > 1 { " (one number a seed)" } else { "" };

@@ -148,15 +148,12 @@ impl ObjectBuilder<'_> {
         let upright = self.rng.chance(0.6);
         for i in 0..count {
             let share = (i + 1) as f32 / (count + 1) as f32;
-            let (slat, x, up) = match upright {
-                true => {
-                    let half = Vec3::new(self.rng.range(0.006, 0.025), 0.5 * back, 0.5 * thick);
-                    (half, (2.0 * share - 1.0) * inner, seat + 0.5 * back)
-                }
-                false => {
-                    let half = Vec3::new(inner, self.rng.range(0.008, 0.03), 0.5 * thick);
-                    (half, 0.0, seat + share * back)
-                }
+            let (slat, x, up) = if upright {
+                let half = Vec3::new(self.rng.range(0.006, 0.025), 0.5 * back, 0.5 * thick);
+                (half, (2.0 * share - 1.0) * inner, seat + 0.5 * back)
+            } else {
+                let half = Vec3::new(inner, self.rng.range(0.008, 0.03), 0.5 * thick);
+                (half, 0.0, seat + share * back)
             };
             self.add(Form::Block, position(x, up, -inner), axes, slat, frame);
         }

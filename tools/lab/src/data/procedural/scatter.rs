@@ -36,15 +36,12 @@ impl Room {
     pub(super) fn scattered(seed: u64) -> Self {
         let mut rng = Rng::new(seed).fork(SCATTERED);
         let outdoors = rng.chance(OUTDOORS);
-        let size = match outdoors {
-            true => {
-                let side = rng.log_range(15.0, 150.0);
-                Vec3::new(side, side * rng.range(0.2, 0.6), side * rng.log_range(0.6, 1.6))
-            }
-            false => {
-                let side = rng.log_range(2.5, 14.0);
-                Vec3::new(side, (side * rng.range(0.3, 0.9)).max(2.2), side * rng.range(0.8, 2.0))
-            }
+        let size = if outdoors {
+            let side = rng.log_range(15.0, 150.0);
+            Vec3::new(side, side * rng.range(0.2, 0.6), side * rng.log_range(0.6, 1.6))
+        } else {
+            let side = rng.log_range(2.5, 14.0);
+            Vec3::new(side, (side * rng.range(0.3, 0.9)).max(2.2), side * rng.range(0.8, 2.0))
         };
         let mut layout = Layout::empty(rng, size);
         layout.scattered_shell(outdoors);
@@ -131,9 +128,10 @@ impl ObjectBuilder<'_> {
     /// Samples a rotation: level in half of the cases, else any.
     fn axes(&mut self) -> Mat3 {
         let turn = self.rng.range(0.0, TAU);
-        let tilt = match self.rng.chance(0.5) {
-            true => [0.0, 0.0],
-            false => [self.rng.range(0.0, TAU), self.rng.range(0.0, TAU)],
+        let tilt = if self.rng.chance(0.5) {
+            [0.0, 0.0]
+        } else {
+            [self.rng.range(0.0, TAU), self.rng.range(0.0, TAU)]
         };
         Mat3::from_quat(Quat::from_euler(EulerRot::YXZ, turn, tilt[0], tilt[1]))
     }

@@ -4,7 +4,7 @@
 //! `one_kernel KERNEL REPEATS` prints how many units one run has: products, samples or pixels. Inputs are
 //! the same for every SIMD level, which `SUBSPLAT_SIMD` chooses.
 
-#[path = "../../benches/common/scene.rs"]
+#[path = "../../../benches/common/scene.rs"]
 #[allow(dead_code, reason = "the benches use all scenes")]
 mod scene;
 

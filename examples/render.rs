@@ -1,0 +1,21 @@
+//! Draws a scene file from a camera that sees all of it, without the network:
+//!
+//! ```text
+//! cargo run --release --example render -- scene.ply view.png
+//! ```
+
+use std::error::Error;
+use subsplat::{Bounds, Rgb, Splats, save_png};
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [scene, out] = arguments.as_slice() else {
+        return Err("expected SCENE OUT.PNG".into());
+    };
+    let splats = Splats::load(scene)?;
+    let bounds = Bounds::of(splats.means()).ok_or("the scene holds no Gaussian")?;
+    let camera = bounds.camera(60f32.to_radians(), 512)?;
+    let picture = splats.render(&camera);
+    save_png(out, &Rgb::from(&picture))?;
+    Ok(())
+}
