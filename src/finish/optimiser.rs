@@ -97,7 +97,7 @@ impl<'a> Optimiser<'a> {
         spared: Vec<bool>,
     ) -> Self {
         let parts = if photographs > 1 { 4 } else { 3 };
-        let elements: usize = phase.moves.iter().map(|m| m.parameter.elements).sum();
+        let elements: usize = phase.moves.iter().map(|m| m.parameter.elements()).sum();
         let mut new = Self {
             before: splats,
             moves: phase.moves.clone(),
@@ -118,7 +118,7 @@ impl<'a> Optimiser<'a> {
 
     /// Elements of the parameters that move.
     fn elements(&self) -> usize {
-        self.moves.iter().map(|m| m.parameter.elements).sum()
+        self.moves.iter().map(|m| m.parameter.elements()).sum()
     }
 
     /// Floats of a block's state.
@@ -159,7 +159,7 @@ impl<'a> Optimiser<'a> {
                     }
                 });
             }
-            at += m.parameter.elements;
+            at += m.parameter.elements();
         }
     }
 
@@ -259,7 +259,7 @@ impl<'a> Optimiser<'a> {
         let pixels = self.pixels.get(block.clone()).unwrap_or_default();
         let mut at = 0;
         for m in &self.moves {
-            let out = &mut scratch.gradient[at * BLOCK..][..m.parameter.elements * BLOCK];
+            let out = &mut scratch.gradient[at * BLOCK..][..m.parameter.elements() * BLOCK];
             let by = part_of(photograph.all, block.clone());
             m.parameter.gradients(rows, by, pixels, out);
             if let (Some(across), Buffer::Rows) = (&photograph.across, m.parameter.buffer) {
@@ -287,7 +287,7 @@ impl<'a> Optimiser<'a> {
                     spared.for_each(|(g, _)| *g = 0.0);
                 }
             }
-            at += m.parameter.elements;
+            at += m.parameter.elements();
         }
         let Scratch { gradient, finite, .. } = scratch;
         let finite = &mut finite[..n];
@@ -348,7 +348,7 @@ impl<'a> Optimiser<'a> {
         for movement in &self.moves {
             let parameter = &movement.parameter;
             let adam = SelectiveAdam { rate: adam.rate * movement.rate, ..*adam };
-            for e in at..at + parameter.elements {
+            for e in at..at + parameter.elements() {
                 let element = e * BLOCK..e * BLOCK + n;
                 let moments = [&mut m[element.clone()], &mut v[element.clone()]];
                 let value = &mut values[element.clone()];
@@ -357,16 +357,18 @@ impl<'a> Optimiser<'a> {
                     value.iter_mut().for_each(|v| *v = v.clamp(least, largest));
                 }
             }
-            let values = &values[at * BLOCK..(at + parameter.elements) * BLOCK];
-            parameter.write(values, moves, &before, rows, gain);
-            at += parameter.elements;
+            let values = &values[at * BLOCK..(at + parameter.elements()) * BLOCK];
+            vectorize(
+                #[inline(always)]
+                || parameter.write(values, moves, &before, rows, gain),
+            );
+            at += parameter.elements();
         }
     }
 
     /// The Gaussians `range` before the phase.
     fn before_of(&self, range: Range<usize>) -> Before<'_> {
         let rows = &self.before.rows[range.start * SPLAT_STRIDE..range.end * SPLAT_STRIDE];
-        // Without offsets of their own, Gaussians have offsets of 0.
         let gain = match self.before.gain_channels() {
             GAIN_STRIDE => &self.before.gain[range.start * GAIN_STRIDE..range.end * GAIN_STRIDE],
             _ => &[],
@@ -605,9 +607,9 @@ mod tests {
             for m in &phase.moves {
                 let count = match m.parameter.form {
                     crate::finish::parameters::Form::CommonFactor => 3,
-                    _ => m.parameter.elements,
+                    _ => m.parameter.elements(),
                 };
-                assert!(m.parameter.elements <= ELEMENTS_MAX && m.rate > 0.0);
+                assert!(m.parameter.elements() <= ELEMENTS_MAX && m.rate > 0.0);
                 moved.extend((0..count).map(|e| (m.parameter.buffer as u8, m.parameter.first + e)));
             }
             let all = moved.len();

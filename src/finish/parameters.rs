@@ -31,25 +31,23 @@ pub(super) enum Buffer {
 /// the logit of its number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Form {
-    /// 1/(1 + e⁻ᵛ).
+    /// 1/(1 + e⁻ᵛ), one number.
     Logit,
-    /// before · eᵛ, each number with an element of its own.
+    /// before · eᵛ, three numbers, each with an element of its own.
     Factor,
-    /// before · eᵛ, all numbers with the same element.
+    /// before · eᵛ, three numbers with the same element.
     CommonFactor,
-    /// before + v.
+    /// before + v, three numbers.
     Offset,
-    /// before + v · size of a pixel at the Gaussian, world units.
+    /// before + v · size of a pixel at the Gaussian (world units), three numbers.
     PixelOffset,
-    /// (before + v) / |before + v|.
+    /// (before + v) / |before + v|, four numbers.
     Direction,
 }
 
 /// One row of the table of parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Parameter {
-    /// Elements of the parameter for one Gaussian, at most [`ELEMENTS_MAX`].
-    pub elements: usize,
     /// Buffer of the numbers that it changes.
     pub buffer: Buffer,
     /// Offset of the first of them in the Gaussian's part of the buffer.
@@ -66,17 +64,17 @@ mod table {
     use super::{MEAN_OFFSET, OPACITY_OFFSET, Parameter, QUAT_OFFSET, SCALE_OFFSET};
 
     /// Opacity, as its logit.
-    pub const OPACITY:  Parameter = Parameter { elements: 1, buffer: Rows, first: OPACITY_OFFSET, form: Logit };
+    pub const OPACITY:  Parameter = Parameter { buffer: Rows, first: OPACITY_OFFSET, form: Logit };
     /// Factor of the three σ together, as Δ ln σ.
-    pub const SIZE:     Parameter = Parameter { elements: 1, buffer: Rows, first: SCALE_OFFSET,   form: CommonFactor };
+    pub const SIZE:     Parameter = Parameter { buffer: Rows, first: SCALE_OFFSET,   form: CommonFactor };
     /// Factor of each σ, as Δ ln σ.
-    pub const SCALES:   Parameter = Parameter { elements: 3, buffer: Rows, first: SCALE_OFFSET,   form: Factor };
+    pub const SCALES:   Parameter = Parameter { buffer: Rows, first: SCALE_OFFSET,   form: Factor };
     /// Colour offsets δ (RGB), display values.
-    pub const COLOUR:   Parameter = Parameter { elements: 3, buffer: Gain, first: 1,              form: Offset };
+    pub const COLOUR:   Parameter = Parameter { buffer: Gain, first: 1,              form: Offset };
     /// Mean, in pixels of the photograph that shows the Gaussian at the largest scale.
-    pub const MEAN:     Parameter = Parameter { elements: 3, buffer: Rows, first: MEAN_OFFSET,    form: PixelOffset };
+    pub const MEAN:     Parameter = Parameter { buffer: Rows, first: MEAN_OFFSET,    form: PixelOffset };
     /// Unit quaternion wxyz.
-    pub const ROTATION: Parameter = Parameter { elements: 4, buffer: Rows, first: QUAT_OFFSET,    form: Direction };
+    pub const ROTATION: Parameter = Parameter { buffer: Rows, first: QUAT_OFFSET,    form: Direction };
 }
 pub(super) use table::*;
 
@@ -90,9 +88,18 @@ pub(super) struct Part<'a> {
 }
 
 impl Parameter {
+    /// Elements of the parameter for one Gaussian, at most [`ELEMENTS_MAX`].
+    pub const fn elements(&self) -> usize {
+        match self.form {
+            Form::Logit | Form::CommonFactor => 1,
+            Form::Factor | Form::Offset | Form::PixelOffset => 3,
+            Form::Direction => 4,
+        }
+    }
+
     /// Writes the gradients by this parameter to `out`, `[elements][BLOCK]`, from those `by` the numbers
-    /// of n ≤ [`BLOCK`] Gaussians. `rows` `[n, 11]` are the Gaussians as rendered; `pixels` `[n]` the
-    /// sizes of a pixel, world units (only for [`Form::PixelOffset`]).
+    /// of n ≤ [`BLOCK`] Gaussians, at least one. `rows` `[n, 11]` are the Gaussians as rendered; `pixels`
+    /// `[n]` the sizes of a pixel, world units (only for [`Form::PixelOffset`]).
     pub fn gradients(&self, rows: &[f32], by: Part<'_>, pixels: &[f32], out: &mut [f32]) {
         let (by, stride) = match self.buffer {
             Buffer::Rows => (by.rows, SPLAT_STRIDE),
@@ -100,46 +107,28 @@ impl Parameter {
         };
         for (e, out) in out.chunks_exact_mut(BLOCK).enumerate() {
             let at = self.first + e;
-            let by = by.chunks_exact(stride);
+            let pairs = out.iter_mut().zip(by[at..].iter().step_by(stride));
+            let numbers = rows[at..].iter().step_by(SPLAT_STRIDE);
             match self.form {
                 Form::Logit => {
-                    for ((to, g), row) in
-                        out.iter_mut().zip(by).zip(rows.chunks_exact(SPLAT_STRIDE))
-                    {
-                        *to = g[at] * row[at] * (1.0 - row[at]);
-                    }
+                    pairs.zip(numbers).for_each(|((to, g), alpha)| *to = g * alpha * (1.0 - alpha));
                 }
-                Form::Factor => {
-                    for ((to, g), row) in
-                        out.iter_mut().zip(by).zip(rows.chunks_exact(SPLAT_STRIDE))
-                    {
-                        *to = g[at] * row[at];
-                    }
-                }
+                Form::Factor => pairs.zip(numbers).for_each(|((to, g), sigma)| *to = g * sigma),
                 Form::CommonFactor => {
-                    for ((to, g), row) in
-                        out.iter_mut().zip(by).zip(rows.chunks_exact(SPLAT_STRIDE))
-                    {
-                        *to = (at..at + 3).map(|i| g[i] * row[i]).sum();
+                    let pairs = by[at..].chunks(stride).zip(rows[at..].chunks(SPLAT_STRIDE));
+                    for (to, (g, sigma)) in out.iter_mut().zip(pairs) {
+                        *to = g.iter().zip(sigma).take(3).map(|(g, sigma)| g * sigma).sum();
                     }
                 }
-                Form::PixelOffset => {
-                    for ((to, g), pixel) in out.iter_mut().zip(by).zip(pixels) {
-                        *to = g[at] * pixel;
-                    }
-                }
-                Form::Offset | Form::Direction => {
-                    for (to, g) in out.iter_mut().zip(by) {
-                        *to = g[at];
-                    }
-                }
+                Form::PixelOffset => pairs.zip(pixels).for_each(|((to, g), pixel)| *to = g * pixel),
+                Form::Offset | Form::Direction => pairs.for_each(|(to, g)| *to = *g),
             }
         }
     }
 
     /// Writes the numbers that this parameter changes, of the Gaussians that move (`moves`, `[n]`).
-    /// `values` `[elements][BLOCK]`; `before` the Gaussians before the phase, whose σ have the factor
-    /// `scale`; `pixels` as in [`Parameter::gradients`]; `rows` `[n, 11]` and `gain` `[n, 4]` receive them.
+    /// `values` `[elements][BLOCK]`; `rows` `[n, 11]` and `gain` `[n, 4]` receive the numbers.
+    #[inline(always)]
     pub fn write(
         &self,
         values: &[f32],
@@ -148,49 +137,78 @@ impl Parameter {
         rows: &mut [f32],
         gain: &mut [f32],
     ) {
-        let (to, stride, from) = match self.buffer {
-            Buffer::Rows => (rows, SPLAT_STRIDE, before.part.rows),
-            Buffer::Gain => (gain, GAIN_STRIDE, before.part.gain),
+        let (to, from, stride) = match self.buffer {
+            Buffer::Rows => (rows, before.part.rows, SPLAT_STRIDE),
+            Buffer::Gain => (gain, before.part.gain, GAIN_STRIDE),
         };
-        let numbers = to.chunks_exact_mut(stride).zip(moves).enumerate().filter(|(_, (_, m))| **m);
-        for (j, (to, _)) in numbers {
-            let value = |e: usize| values[e * BLOCK + j];
-            let from = |at: usize| from.get(j * stride + at).copied().unwrap_or(0.0);
-            match self.form {
-                Form::Logit => to[self.first] = 1.0 / (1.0 + (-value(0)).exp()),
-                Form::Factor => {
-                    for e in 0..self.elements {
-                        let at = self.first + e;
-                        to[at] = from(at) * (before.scale * value(e).exp());
-                    }
-                }
-                Form::CommonFactor => {
-                    let factor = before.scale * value(0).exp();
-                    for at in self.first..self.first + 3 {
-                        to[at] = from(at) * factor;
-                    }
-                }
-                Form::Offset => {
-                    for e in 0..self.elements {
-                        to[self.first + e] = from(self.first + e) + value(e);
-                    }
-                }
-                Form::PixelOffset => {
-                    for e in 0..self.elements {
-                        to[self.first + e] = from(self.first + e) + before.pixels[j] * value(e);
-                    }
-                }
-                Form::Direction => {
-                    let q: [f32; 4] = std::array::from_fn(|e| from(self.first + e) + value(e));
+        // Gaussians without offsets of their own have offsets of 0.
+        let from = if from.is_empty() { &ZEROS[..to.len()] } else { from };
+        let (to, from) = (&mut to[self.first..], &from[self.first..]);
+        let (scale, pixels) = (before.scale, before.pixels);
+        let (columns, _) = values.as_chunks::<BLOCK>();
+        match (self.form, columns) {
+            (Form::Logit, [value]) => {
+                each::<1>(to, from, stride, moves, |j, [to], _| {
+                    *to = 1.0 / (1.0 + (-value[j]).exp());
+                });
+            }
+            (Form::Factor, [x, y, z]) => {
+                each::<3>(to, from, stride, moves, |j, to, from| {
+                    let value = [x[j], y[j], z[j]];
+                    *to = std::array::from_fn(|k| from[k] * (scale * value[k].exp()));
+                });
+            }
+            (Form::CommonFactor, [value]) => {
+                each::<3>(to, from, stride, moves, |j, to, from| {
+                    let factor = scale * value[j].exp();
+                    *to = from.map(|sigma| sigma * factor);
+                });
+            }
+            (Form::PixelOffset, [x, y, z]) => {
+                each::<3>(to, from, stride, moves, |j, to, from| {
+                    let (value, pixel) = ([x[j], y[j], z[j]], pixels[j]);
+                    *to = std::array::from_fn(|k| from[k] + pixel * value[k]);
+                });
+            }
+            (Form::Offset, [x, y, z]) => {
+                each::<3>(to, from, stride, moves, |j, to, from| {
+                    let value = [x[j], y[j], z[j]];
+                    *to = std::array::from_fn(|k| from[k] + value[k]);
+                });
+            }
+            (Form::Direction, [w, x, y, z]) => {
+                each::<4>(to, from, stride, moves, |j, to, from| {
+                    let value = [w[j], x[j], y[j], z[j]];
+                    let q: [f32; 4] = std::array::from_fn(|k| from[k] + value[k]);
                     let length = q.iter().map(|q| q * q).sum::<f32>().sqrt();
                     // A quaternion of zero has no direction: the last one stays.
                     if length > 0.0 {
-                        for (to, q) in to[self.first..].iter_mut().zip(q) {
-                            *to = q / length;
-                        }
+                        *to = q.map(|q| q / length);
                     }
-                }
+                });
             }
+            _ => debug_assert!(false, "{self:?} has {} elements", columns.len()),
+        }
+    }
+}
+
+/// Offsets of a block of Gaussians without offsets.
+static ZEROS: [f32; BLOCK * GAIN_STRIDE] = [0.0; BLOCK * GAIN_STRIDE];
+
+/// Calls `f` for each Gaussian that moves, with its index, the numbers to write and those before. `to` and
+/// `from` begin at the parameter's first number of the first Gaussian.
+#[inline(always)]
+fn each<const N: usize>(
+    to: &mut [f32],
+    from: &[f32],
+    stride: usize,
+    moves: &[bool],
+    f: impl Fn(usize, &mut [f32; N], &[f32; N]),
+) {
+    let numbers = to.chunks_mut(stride).zip(from.chunks(stride));
+    for (j, ((to, from), moves)) in numbers.zip(moves).enumerate() {
+        if let (true, Some(to), Some(from)) = (*moves, to.first_chunk_mut(), from.first_chunk()) {
+            f(j, to, from);
         }
     }
 }
