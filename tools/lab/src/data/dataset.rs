@@ -216,7 +216,7 @@ impl Dataset {
             }
             None => {
                 let paths = scene_paths(path)?;
-                Source::Scenes(paths.iter().map(|p| load_scene(p)).collect::<Result<_>>()?)
+                Source::Scenes(paths.iter().map(load_scene).collect::<Result<_>>()?)
             }
         };
         Ok(Self {

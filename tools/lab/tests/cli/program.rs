@@ -3,7 +3,7 @@
 use serde_json::Value;
 use std::path::Path;
 use std::process::Command;
-pub use subsplat_test_support::scene_folder::{SIDE, files, named, workplace};
+pub use subsplat_test_support::scene_folder::{files, workplace};
 
 /// Exit code and output of one call of the program.
 pub struct Called {
