@@ -1,6 +1,6 @@
 //! An opened device: the CPU kernels, or their WGSL versions on a GPU.
 //!
-//! One [`Backend`] serves the network's ops and the [`subsplat::scene::render::Renderer`]. Tensors stay in
+//! One [`Backend`] serves the network's ops and the `subsplat::scene::render::Renderer`. Tensors stay in
 //! host memory. The CPU kernels take over calls that the GPU cannot execute: `f64`, more samples
 //! than the kernel supports, a lost device. [`Backend::warning`] then returns the reason.
 //!

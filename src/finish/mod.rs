@@ -1,9 +1,9 @@
 //! Optimises the Gaussians of a scene on its photographs, after the network has predicted them, and
 //! makes a finished scene smaller.
 //!
-//! An optimisation is one or more phases ([`phase`]), each a value that says which parameters move
-//! ([`parameters`]), on which photographs and losses, and when it ends. One optimiser takes the steps of
-//! all phases ([`optimiser`]), and one loop runs them ([`refiner`]):
+//! An optimisation is one or more phases (`phase`), each a value that says which parameters move
+//! (`parameters`), on which photographs and losses, and when it ends. One optimiser takes the steps of
+//! all phases (`optimiser`), and one loop runs them (`refiner`):
 //!
 //! 1. [`fit()`]: sizes, opacities and colours, on all photographs at once, four steps;
 //! 2. [`refine()`]: means, shapes, opacities and colours, on one photograph after the other, some dozens of

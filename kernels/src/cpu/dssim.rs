@@ -1,5 +1,5 @@
 //! SSIM of one plane over windows inside the picture, and its derivative (Wang et al.
-//! 2004). Reference and conventions: finish/loss.rs, [`subsplat::scene::metrics::ssim`].
+//! 2004). Reference and conventions: finish/loss.rs, `subsplat::scene::metrics::ssim`.
 //!
 //! Windowed means are two passes of N taps, each with a block of results in registers.
 //! The transpose of a windowed mean is a windowed mean with reversed taps of the map with

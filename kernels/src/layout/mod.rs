@@ -200,7 +200,7 @@ pub const HEAD_GAIN_OFFSET: usize = 10;
 /// Floats of a record from the geometry head g_θ; the appearance head h_φ gives the rest.
 pub const HEAD_GEOMETRY_LEN: usize = 9;
 
-/// Distribution of a parent's opacity over its children ([`subsplat::network::ops::redistribute`]). Kernels
+/// Distribution of a parent's opacity over its children (`subsplat::network::ops::redistribute`). Kernels
 /// read the discriminant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
