@@ -487,7 +487,7 @@ fn errors_name_key_and_value() {
 
 #[test]
 fn every_preset_file_is_a_configuration() {
-    let folder = subsplat_test_support::repository().join("tools/train");
+    let folder = subsplat_test_support::repository().join("tools/lab/train");
     let mut count = 0;
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
