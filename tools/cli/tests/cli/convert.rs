@@ -13,10 +13,12 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
+use subsplat::Backend;
 use subsplat::files::tensors::{TensorFile, TensorSpec, write_tensors};
 use subsplat::network::config::{Backbone, Config, Preset, SpgrHead};
 use subsplat::network::model::subsplat::SubSplat;
 use subsplat::network::model::weights::{Weights, read_tensors, save};
+use subsplat_lab::compare::compare;
 use subsplat_lab::lpips::Lpips;
 
 /// Name to shape and elements.
@@ -139,14 +141,9 @@ fn a_whole_checkpoint_is_the_same_model() {
         assert!(peak < bytes / 2, "{peak} bytes for a checkpoint of {bytes}");
     }
 
-    let compared = called(
-        Command::new(env!("CARGO_BIN_EXE_subsplat"))
-            .args(["compare", "--json", "--weights"])
-            .arg(&out)
-            .arg("--reference")
-            .arg(reference),
-    );
-    assert_eq!((compared.code, &compared.json()["ok"]), (0, &true.into()), "{}", compared.stderr);
+    let weights = Weights::load(&out).unwrap();
+    let report = compare(&weights, reference.as_ref(), &Backend::Cpu).unwrap();
+    assert!(report.ok());
 }
 
 #[test]

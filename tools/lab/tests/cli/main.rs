@@ -5,3 +5,4 @@ mod eval_cli;
 mod paper;
 mod program;
 mod train;
+mod usage;
