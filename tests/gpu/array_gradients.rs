@@ -176,7 +176,7 @@ fn products() {
         steps,
         None
     ));
-    same_gradients!(gpu, "constant weight", TOLERANCE, [weight], |x| Array::conv2d(
+    same_gradients!(gpu, "constant weight", TOLERANCE, [weight], |x| Array::conv3d(
         x, weight, None, steps, None
     ));
     for (n, c, o) in [(1, 1, 1), (2200, 67, 70), (64, 128, 64), (300, 11, 5)] {

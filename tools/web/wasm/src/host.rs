@@ -16,7 +16,7 @@ unsafe extern "C" {
 /// Lets the library wait for a GPU.
 #[cfg(all(target_family = "wasm", target_os = "unknown"))]
 pub(crate) fn allow_waiting() {
-    subsplat_kernels::gpu::set_gpu_wait(|| suspend(), || resume());
+    subsplat::kernels::gpu::set_gpu_wait(|| suspend(), || resume());
 }
 
 #[cfg(not(all(target_family = "wasm", target_os = "unknown")))]
