@@ -1,5 +1,6 @@
 //! Oracles, scenes and file writers that several test programs share.
 
+pub mod answers;
 pub mod checkpoints;
 pub mod chunk_files;
 pub mod colmap_files;

@@ -4,6 +4,7 @@ use crate::program::{call_in, call_with, files};
 use std::path::Path;
 use subsplat::network::config::Config;
 use subsplat::network::model::weights::save;
+use subsplat_test_support::answers::{keys, seconds};
 use subsplat_test_support::shared;
 
 #[test]
@@ -22,7 +23,10 @@ fn impossible_values_are_wrong_usage() {
         let told = called.json();
         let error = told["error"].as_str().unwrap();
         assert!(error.contains(named), "{arguments}: expected `{named}` in: {error}");
+        assert!(called.stderr.contains(error), "{arguments}: {}", called.stderr);
     }
+    let plain = call_in(place.path(), "compare --weights w");
+    assert_eq!((plain.code, plain.stdout.as_str()), (2, ""));
     assert!(files(place.path()).is_empty());
 }
 
@@ -30,9 +34,15 @@ fn impossible_values_are_wrong_usage() {
 fn missing_weights_are_named() {
     let place = tempfile::tempdir().unwrap();
     std::fs::write(place.path().join("file"), "x").unwrap();
+    let before = files(place.path());
     let called = call_in(place.path(), "--json compare --weights nowhere --reference file");
     assert_eq!(called.code, 1, "{}", called.stderr);
-    assert!(called.error().contains("nowhere"), "{}", called.stderr);
+    let error = called.error();
+    assert!(error.contains("nowhere"), "{error}");
+    assert_eq!(format!("error: {}", called.json()["error"].as_str().unwrap()), error);
+    assert!(error.matches("os error").count() <= 1, "told twice: {error}");
+    assert!(!called.stderr.contains("panicked"), "{}", called.stderr);
+    assert_eq!(files(place.path()), before, "files were left behind");
 }
 
 #[test]
@@ -49,10 +59,8 @@ fn compare_says_yes_and_no() {
         let called =
             call_with(place.path(), &[&words[..], &[reference.to_str().unwrap()]].concat(), &[]);
         let report = called.json();
-        for key in ["tensor", "max_abs", "relative", "allowed", "ok"] {
-            assert!(!report["tensors"][0][key].is_null(), "{key}");
-        }
-        assert!(report["seconds"]["encoder"].as_f64().unwrap() > 0.0);
+        keys(&report["tensors"][0], &["tensor", "max_abs", "relative", "allowed", "ok"]);
+        seconds(&report, &["encoder"]);
         assert_eq!(report["ok"].as_bool().unwrap(), called.code == 0);
         (called.code, report["tensors"].as_array().unwrap().len())
     };
