@@ -52,6 +52,13 @@ fn intrinsics(camera: &ExifCamera, width: usize, height: usize) -> Option<Intrin
 }
 
 impl Photograph {
+    /// Upright sRGB pixels (an [`Rgb`] or an `image::RgbImage`) of a photograph in memory, about whose
+    /// camera nothing is known.
+    pub fn from_pixels(image: impl Into<Rgb>) -> Self {
+        let (image, camera) = (image.into(), ExifCamera::default());
+        Self { image, orientation: None, camera, warnings: Vec::new() }
+    }
+
     /// Returns intrinsics of EXIF's focal length, px, with the principal point in the middle;
     /// `None` if EXIF does not determine it.
     pub fn intrinsics(&self) -> Option<Intrinsics> {

@@ -60,7 +60,10 @@ fn bad_arguments() {
         ("run scene/images/view0.png", "one photograph"),
         ("run scene/images/view0.png scene/images/view2.png --move 1,0,0", "--fov"),
         ("run scene/images/view0.png scene/images/view2.png --fov 50 --turn 0,3,0", "--move"),
-        ("run scene/images/view0.png scene/images/view2.png --fov 50 --move 0,0,0", "different places"),
+        (
+            "run scene/images/view0.png scene/images/view2.png --fov 50 --move 0,0,0",
+            "different places",
+        ),
         ("run scene/images/view0.png file --fov 50 --move 1,0,0", "file"),
         ("run scene --context 0,2 --weights file", "safetensors"),
         ("run scene --context 0,2 --config file", "file"),
