@@ -338,7 +338,9 @@ fn write_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) 
     };
     let frames = content.cameras.iter().map(|c| {
         let (fx, fy, cx, cy, width, height, c2w) = frame(c);
-        let (file, depth, timestamp_us) = (c.file.as_str(), c.depth.as_deref(), c.timestamp);
+        let file = c.file.as_str();
+        let depth = c.depth.as_deref();
+        let timestamp_us = c.timestamp;
         let pixels = (c.pixels == Pixels::Upright).then_some(UPRIGHT);
         OutFrame { file, pixels, depth, timestamp_us, width, height, fx, fy, cx, cy, c2w }
     });
@@ -348,7 +350,8 @@ fn write_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) 
         Units::RealEstate10k => Some("re10k"),
     };
     let (near, far) = content.near_far.map(|range| (range.near, range.far)).unzip();
-    let (frames, points) = (frames.collect(), points.iter().map(Vec3::to_array).collect());
+    let frames = frames.collect();
+    let points = points.iter().map(Vec3::to_array).collect();
     let out = OutFile { convention: CONVENTION, units, near, far, frames, points };
     let text = serde_json::to_string_pretty(&out)
         .map_err(|e| Error::io(path, std::io::Error::other(e)))?;

@@ -64,9 +64,14 @@ pub(super) fn check_size(width: u32, height: u32, path: &Path) -> Result<()> {
     Ok(())
 }
 
+/// A file or its bytes. One type for both: the decoders are generic, and are then compiled once.
+pub(super) trait Input: BufRead + Seek {}
+
+impl<R: BufRead + Seek> Input for R {}
+
 /// Opens a decoder and checks the size. The content selects the decoder, not the file's
 /// extension.
-pub(super) fn decoder<'a, R: BufRead + Seek + 'a>(input: R, path: &Path) -> Result<Opened<'a>> {
+pub(super) fn decoder<'a>(input: Box<dyn Input + 'a>, path: &Path) -> Result<Opened<'a>> {
     let mut reader = ImageReader::new(input);
     let mut limits = Limits::default();
     // 16-bit RGBA of the largest size, and as much again for the decoder.
@@ -104,7 +109,7 @@ pub(super) fn header(path: &Path) -> Result<Header> {
     if heic {
         return heic::header(&read(path)?, path);
     }
-    let Opened { mut decoder, format } = decoder(reader, path)?;
+    let Opened { mut decoder, format } = decoder(Box::new(reader), path)?;
     let (width, height) = decoder.dimensions();
     // A picture with a malformed EXIF block still decodes.
     let orientation = decoder.orientation().map_or(1, Orientation::to_exif);
@@ -132,7 +137,7 @@ pub(super) fn decode<'a>(
         if jpeg::is_jpeg(bytes) {
             check_jpeg(bytes, options, path, &mut warnings)?;
         }
-        let Opened { mut decoder, format } = decoder(Cursor::new(bytes), path)?;
+        let Opened { mut decoder, format } = decoder(Box::new(Cursor::new(bytes)), path)?;
         let profile = decoder.icc_profile().unwrap_or_else(|e| {
             warnings.push(format!("{}: the ICC profile is ignored: {e}", path.display()));
             None

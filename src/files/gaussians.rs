@@ -399,7 +399,8 @@ impl Incoming {
     /// Makes a set of all Gaussians. Their numbers may be NaN or infinite.
     pub fn into_splats(self, path: &Path) -> Result<Splats> {
         let Self { rows, sh, sh_degree } = self;
-        let (gain, sh_basis) = (Vec::new(), ShBasis::Standard);
+        let gain = Vec::new();
+        let sh_basis = ShBasis::Standard;
         Splats::with_unchecked_numbers(SplatParts { rows, sh, gain, sh_degree, sh_basis })
             .map_err(|e| Error::format(path, "Gaussians of one shape", e.to_string()))
     }

@@ -175,7 +175,8 @@ fn chunks<'a>(bytes: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
         let got = format!("{:02x?}", &bytes[..bytes.len().min(4)]);
         return Err(Error::format(path, "the magic glTF (.glb)", got));
     }
-    let (version, length) = (u32_at(bytes, 4, path)?, u32_at(bytes, 8, path)? as usize);
+    let version = u32_at(bytes, 4, path)?;
+    let length = u32_at(bytes, 8, path)? as usize;
     if version != 2 {
         return Err(Error::format(path, "glTF binary version 2", version.to_string()));
     }
@@ -187,7 +188,8 @@ fn chunks<'a>(bytes: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
         return Err(Error::format(path, expected, bytes.len().to_string()));
     }
     let chunk = |at: usize, kind: Option<(u32, &str)>| -> Result<(&'a [u8], usize)> {
-        let (size, got) = (u32_at(bytes, at, path)? as usize, u32_at(bytes, at + 4, path)?);
+        let size = u32_at(bytes, at, path)? as usize;
+        let got = u32_at(bytes, at + 4, path)?;
         if let Some((_, name)) = kind.filter(|(kind, _)| got != *kind) {
             let expected = format!("a {name} chunk");
             let place = format!(" at byte {at}");

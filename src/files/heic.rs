@@ -165,7 +165,8 @@ mod supported {
         let properties = context.props(item).map_err(refused)?;
         let transforms: Vec<_> = properties.transforms.iter().map(|t| transform(*t)).collect();
         let frame = decode_primary(&context, item).map_err(refused)?;
-        let (layout, limit) = (PixelLayout::Rgb8, MAX_PIXELS);
+        let layout = PixelLayout::Rgb8;
+        let limit = MAX_PIXELS;
         let coding = coding(properties.nclx);
         let decoded = heic_rs::color::convert(&frame, None, coding, layout, limit, None)
             .and_then(|image| heic_rs::transform::apply_all(image, &transforms))

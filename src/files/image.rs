@@ -343,7 +343,7 @@ pub fn parse_depth_png(bytes: &[u8], unit: f32, path: impl AsRef<Path>) -> Resul
 }
 
 fn decode_depth_png(bytes: &[u8], unit: f32, path: &Path) -> Result<Depth> {
-    let decoder = decoder(std::io::Cursor::new(bytes), path)?.decoder;
+    let decoder = decoder(Box::new(std::io::Cursor::new(bytes)), path)?.decoder;
     let decoded =
         image::DynamicImage::from_decoder(decoder).map_err(|e| decode::refused(path, e))?;
     let image::DynamicImage::ImageLuma16(grey) = decoded else {

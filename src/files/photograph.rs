@@ -55,7 +55,8 @@ impl Photograph {
     /// Upright sRGB pixels (an [`Rgb`] or an `image::RgbImage`) of a photograph in memory, about whose
     /// camera nothing is known.
     pub fn from_pixels(image: impl Into<Rgb>) -> Self {
-        let (image, camera) = (image.into(), ExifCamera::default());
+        let image = image.into();
+        let camera = ExifCamera::default();
         Self { image, orientation: None, camera, warnings: Vec::new() }
     }
 

@@ -232,7 +232,8 @@ impl Header {
         }
         let start = source.left;
         let mut encoding = None;
-        let (mut elements, mut comments) = (Vec::<Element>::new(), Vec::new());
+        let mut elements = Vec::<Element>::new();
+        let mut comments = Vec::new();
         loop {
             let line = source.line("a header line or `end_header`")?;
             if start - source.left > HEADER_MAX {

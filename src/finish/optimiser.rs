@@ -195,7 +195,8 @@ impl<'a> Optimiser<'a> {
 
     /// Adds the gradients of a photograph that is not the last of its step.
     pub fn add(&mut self, photograph: &PhotographGradients<'_>) {
-        let (size, part) = (self.block_size(), self.elements() * BLOCK);
+        let size = self.block_size();
+        let part = self.elements() * BLOCK;
         let mut states = std::mem::take(&mut self.states);
         let rows = self.rows.par_chunks(BLOCK * SPLAT_STRIDE);
         states.par_chunks_exact_mut(size).zip(rows).enumerate().with_min_len(TASK).for_each_init(
@@ -219,7 +220,8 @@ impl<'a> Optimiser<'a> {
             corrections: BETAS.map(|b| 1.0 - b.powi(self.steps)),
             epsilon: EPSILON,
         };
-        let (size, part) = (self.block_size(), self.elements() * BLOCK);
+        let size = self.block_size();
+        let part = self.elements() * BLOCK;
         let mut states = std::mem::take(&mut self.states);
         let (mut rows, mut gain) = (std::mem::take(&mut self.rows), std::mem::take(&mut self.gain));
         let numbers =
@@ -585,7 +587,8 @@ mod tests {
                     sum.iter_mut().zip(g).for_each(|(s, g)| *s += if finite { g } else { 0.0 });
                 }
                 alone.advance(&sum, &rates, step, [-0.5, 0.5]);
-                let (quat, mean) = (alone.row[QUAT_OFFSET..SCALE_OFFSET].to_vec(), 0.0);
+                let quat = alone.row[QUAT_OFFSET..SCALE_OFFSET].to_vec();
+                let mean = 0.0;
                 let (before, offsets) = (row_of(&splats.rows, i), gain_of(&splats.gain, i));
                 alone.write(before, offsets, mean, sharper.scale);
                 alone.row[QUAT_OFFSET..SCALE_OFFSET].copy_from_slice(&quat);

@@ -166,7 +166,8 @@ impl Parameter {
             }
             (Form::PixelOffset, [x, y, z]) => {
                 each::<3>(to, from, stride, moves, |j, to, from| {
-                    let (value, pixel) = ([x[j], y[j], z[j]], pixels[j]);
+                    let value = [x[j], y[j], z[j]];
+                    let pixel = pixels[j];
                     *to = std::array::from_fn(|k| from[k] + pixel * value[k]);
                 });
             }

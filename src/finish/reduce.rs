@@ -47,7 +47,8 @@ pub fn reduce(
     renderer: &mut Renderer,
 ) -> Splats {
     let indices: Vec<usize> = (0..splats.len()).collect();
-    let (all, count) = (folded(splats, &indices), count.max(1));
+    let all = folded(splats, &indices);
+    let count = count.max(1);
     if all.len() <= count {
         return all;
     }
@@ -149,7 +150,8 @@ fn merge_round(splats: &Splats, shares: &mut Vec<f32>, most: usize) -> Splats {
             let partners = order[at + 1..].iter().take(NEIGHBOURS);
             let (order, members) = (&order, &members);
             partners.map(move |&partner| {
-                let (a, b) = (order[at] as usize, partner as usize);
+                let a = order[at] as usize;
+                let b = partner as usize;
                 let cost = cost(&members[a], &members[b]);
                 Pair { cost, first: a.min(b) as u32, second: a.max(b) as u32 }
             })

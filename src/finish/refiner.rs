@@ -214,7 +214,8 @@ impl<'a> Refiner<'a> {
 
     /// Takes the start of the phase with the smallest measure. The first one has the measure `first`.
     fn choose_start(&mut self, first: f64, renderer: &mut Renderer) {
-        let (mut best, starts) = (first, self.phase.starts);
+        let mut best = first;
+        let starts = self.phase.starts;
         let mut chosen = starts.first();
         for start in starts.iter().skip(1) {
             self.optimiser.begin(Some(*start));
@@ -293,7 +294,8 @@ pub(super) fn run(
             last = Some(error);
         }
     }
-    let (steps, after) = (refiner.steps(), refiner.error(renderer));
+    let steps = refiner.steps();
+    let after = refiner.error(renderer);
     // An error that is not a number fails the comparison as well.
     if !(after < before) {
         return Ok(Outcome::unchanged(steps, before));
@@ -330,7 +332,8 @@ fn coprime(a: usize, b: usize) -> bool {
 /// The Gaussians `range` of `slices`, whole families of packed rows.
 fn part_of<'s>(slices: SplatSlices<'s>, range: &Range<usize>) -> SplatSlices<'s> {
     let Geometry::Packed(rows) = slices.geometry else { return slices };
-    let (children, set) = (slices.children_per_parent(), 3 * sh_coefficients(slices.sh_degree));
+    let children = slices.children_per_parent();
+    let set = 3 * sh_coefficients(slices.sh_degree);
     let parents = range.start / children..range.end / children;
     SplatSlices {
         geometry: Geometry::Packed(&rows[range.start * SPLAT_STRIDE..range.end * SPLAT_STRIDE]),

@@ -64,7 +64,8 @@ pub(super) fn pruned(
     let shares = shares(splats, views, raster, renderer);
     let hidden = hidden(&shares, photographs, least_share);
     let keep: Vec<bool> = hidden.into_iter().map(|hidden| !hidden).collect();
-    let (children, mut end) = (splats.children_per_parent(), 0);
+    let children = splats.children_per_parent();
+    let mut end = 0;
     let ranges: Vec<Range<usize>> = groups
         .ranges
         .iter()
@@ -92,7 +93,8 @@ pub(crate) fn shares(
     let raster = RasterOptions { sh_basis: splats.sh_basis, ..*raster };
     let gain = gain_with_offsets(&splats.gain, splats.len());
     let slices = SplatSlices { gain: &gain, ..render::slices(splats) };
-    let (mut shares, mut pixels) = (vec![0.0f32; parents], 0);
+    let mut shares = vec![0.0f32; parents];
+    let mut pixels = 0;
     let mut gradients = Gradients::default();
     for view in views {
         let count = view.image.width * view.image.height;

@@ -120,7 +120,8 @@ impl SceneChildren {
             let size = per_view * children.k;
             let ranges = (0..photographs).map(|view| view * size..(view + 1) * size).collect();
             let groups = Groups { ranges, equal_families: true };
-            let (splats, origins) = (children.to_splats()?, Origins::Regular);
+            let splats = children.to_splats()?;
+            let origins = Origins::Regular;
             return Ok(Self { splats, groups, distances: depths, origins });
         };
         let (mixed, distances) = encoding.mixed(network, &parents, &counts, checkpoint)?;

@@ -138,7 +138,8 @@ fn largest(shares: &[f32], limit: usize) -> Vec<u8> {
 fn steps_of(parent: u32, grids: &[usize], gains: impl Iterator<Item = f32>) -> Vec<Step> {
     let mut steps: Vec<(Step, f32)> = Vec::new();
     for (pair, gain) in grids.windows(2).zip(gains) {
-        let (mut gain, mut cost) = (gain.max(0.0), pair[1] * pair[1] - pair[0] * pair[0]);
+        let mut gain = gain.max(0.0);
+        let mut cost = pair[1] * pair[1] - pair[0] * pair[0];
         while steps.last().is_some_and(|(last, _)| last.slope < gain / cost as f32) {
             if let Some((last, last_gain)) = steps.pop() {
                 (gain, cost) = (gain + last_gain, cost + last.cost);
@@ -168,7 +169,8 @@ fn variances(input: &Cropped, grids: &[usize]) -> Vec<Vec<f32>> {
             let (x, y) = (i % w * r, i / w * r);
             let mut sum = 0.0;
             for at in 0..side * side {
-                let (left, top) = (x + at % side * cell, y + at / side * cell);
+                let left = x + at % side * cell;
+                let top = y + at / side * cell;
                 let mut mean = [0f32; 3];
                 for row in top..top + cell {
                     let begin = 3 * (row * size.0 + left);

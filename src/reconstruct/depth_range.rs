@@ -202,7 +202,8 @@ impl DepthBounds {
         }
         let [low, high] = SPARSE_QUANTILES.map(|q| quantile(&mut depths, q));
         let source = DepthSource::SparsePoints { depths: depths.len() };
-        let (near, far) = (low / SPARSE_NEAR_MARGIN, high * SPARSE_FAR_MARGIN);
+        let near = low / SPARSE_NEAR_MARGIN;
+        let far = high * SPARSE_FAR_MARGIN;
         Ok(Some(Self { near, far, source }))
     }
 

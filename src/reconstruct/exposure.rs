@@ -112,7 +112,8 @@ mod tests {
     fn photo(gain: f32) -> Photo {
         let mut image = Rgb::black(96, 96);
         for (i, p) in image.data.chunks_exact_mut(3).enumerate() {
-            let (x, y) = ((i % 96) as f32, (i / 96) as f32);
+            let x = (i % 96) as f32;
+            let y = (i / 96) as f32;
             let levels = [40.0 + 1.3 * x, 50.0 + 1.2 * y, 60.0 + 0.6 * (x + y)];
             p.iter_mut().zip(levels).for_each(|(p, v)| *p = (gain * v).round() as u8);
         }

@@ -124,13 +124,14 @@ impl Prepared<'_> {
         let SceneChildren { mut splats, mut groups, distances, .. } = children;
         let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
-        let (fit_options, refine_options) =
-            (&options.fit, options.refine_options(inputs.len(), splats.len()));
+        let fit_options = &options.fit;
+        let refine_options = options.refine_options(inputs.len(), splats.len());
         if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;
             let mut part = tracker.parts(progress);
             let mut step = |step| part(step as f32 / fit_options.steps as f32);
-            let (raster, how) = (&raster_options, fit_options);
+            let raster = &raster_options;
+            let how = fit_options;
             let done = fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
             fit = Some(done);
         }

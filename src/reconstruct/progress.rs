@@ -323,7 +323,8 @@ mod tests {
     /// Without the flag that a break sets, the work would run to its end before the call returns.
     #[test]
     fn a_break_ends_the_work_at_its_next_checkpoint() {
-        let (mut tracker, ended_early) = (tracker(), AtomicBool::new(false));
+        let mut tracker = tracker();
+        let ended_early = AtomicBool::new(false);
         tracker.begin(Stage::Backbone, &mut |_| ControlFlow::Continue(())).unwrap();
         let mut stop = |_: Progress| ControlFlow::Break(());
         let result = tracker.run_steps(4, &mut stop, |checkpoint| {

@@ -185,7 +185,8 @@ impl Reconstructor {
     ) -> Result<Prepared<'_>> {
         check_refine(options.refine)?;
         let sizes: Vec<Size> = photos.iter().map(Photo::size).collect();
-        let (stride, upscale) = (self.config().stride(), self.config().upscale);
+        let stride = self.config().stride();
+        let upscale = self.config().upscale;
         let input_size = options.input_size_for(&sizes, stride, upscale);
         let target_size = options.target_size.resolve(input_size, upscale);
         let crop = CropOptions { target_size, ..self.crop_options(input_size) };

@@ -228,7 +228,8 @@ impl Levels {
     /// it selects level 0 everywhere.
     pub fn select(&self, camera: &Camera, cell_px: f32) -> Selection {
         let k = camera.intrinsics();
-        let (eye, focal) = (camera.position(), k.fx.max(k.fy));
+        let eye = camera.position();
+        let focal = k.fx.max(k.fy);
         let level = |block: &Block| {
             let distance = (block.centre - eye).length() - block.radius;
             // A comparison with NaN is false.
@@ -330,7 +331,8 @@ fn block(splats: &Splats, grid: &Grid, first: usize, codes: &[(u64, u32)]) -> (B
     let high = entries.iter().fold(DVec3::NEG_INFINITY, |m, e| m.max(e.blob.mean));
     let centre = if entries.is_empty() { DVec3::ZERO } else { 0.5 * (low + high) };
     let radius = entries.iter().fold(0.0, |r: f64, e| r.max((e.blob.mean - centre).length()));
-    let (centre, radius) = (centre.as_vec3(), radius as f32);
+    let centre = centre.as_vec3();
+    let radius = radius as f32;
     let new = Block { centre, radius, first, count: codes.len(), coarse: Vec::new() };
     (new, coarse(entries, own.sh, 3 * splats.sh_coefficients(), grid))
 }

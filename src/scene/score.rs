@@ -28,7 +28,8 @@ impl Score {
     pub fn of(picture: &[f32], truth: &Rgb) -> Result<Self, MetricsError> {
         let (w, h) = (truth.width, truth.height);
         let truth = truth.to_unit();
-        let (own, theirs) = (mean_gradient(picture, w, h)?, mean_gradient(&truth, w, h)?);
+        let own = mean_gradient(picture, w, h)?;
+        let theirs = mean_gradient(&truth, w, h)?;
         Ok(Self {
             psnr: psnr(picture, &truth, w, h)?,
             ssim: ssim(picture, &truth, w, h)?,

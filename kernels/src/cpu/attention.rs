@@ -59,7 +59,9 @@ impl Attention {
         k: &Packed,
         p: &mut [f32],
     ) -> Vec<f32> {
-        let (rows, m, d) = (p.len() / self.keys, self.keys, self.width);
+        let rows = p.len() / self.keys;
+        let m = self.keys;
+        let d = self.width;
         product((p, m), Mat::new(q, rows, d, d), k, self.scale, Base::Zero);
         let labels = self.labels.as_ref().map(|l| {
             let w = r % l.windows;

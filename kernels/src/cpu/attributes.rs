@@ -192,7 +192,8 @@ impl Attributes {
             for i in 0..3 {
                 let mean = &mut out[MEAN_OFFSET + i];
                 *mean = V::constant(self.source.rotation[i][2]).fma(d_z, *mean);
-                let (s, least) = (row[SCALE_OFFSET + i], V::constant(self.scale_min));
+                let s = row[SCALE_OFFSET + i];
+                let least = V::constant(self.scale_min);
                 let slope = d[SCALE + i] / s.max(least);
                 out[SCALE_OFFSET + i] = least.lt(s).select_or_zero(slope);
             }

@@ -215,7 +215,8 @@ pub fn mixed_residuals(
             .map(|side| (side > 1 && sides.contains(&side)).then(|| Prepared::new(view, side)))
             .collect();
         let end = |limit: usize| parents.partition_point(|p| (*p as usize) < limit);
-        let (begin, end) = (end(first), end(first + per_view));
+        let begin = end(first);
+        let end = end(first + per_view);
         let children = parents[begin..end].par_iter().zip(means[3 * begin..3 * end].par_chunks(3));
         out[3 * begin..3 * end].par_chunks_mut(3).zip(children).with_min_len(1024).for_each(
             |(out, (parent, mean))| {
@@ -325,7 +326,8 @@ mod tests {
             for v in 0..2 {
                 for i in 0..W * H {
                     let at = |k: usize, c: usize| {
-                        let (x, y) = (i % W * r + k % r, i / W * r + k / r);
+                        let x = i % W * r + k % r;
+                        let y = i / W * r + k / r;
                         photos[v][3 * (y * W * r + x) + c]
                     };
                     for c in 0..3 {

@@ -102,7 +102,8 @@ fn run<const N: usize>(
     factor: f32,
     g: &mut [f32],
 ) -> f64 {
-    let (inner, height) = (width + 1 - N, x.len() / width);
+    let inner = width + 1 - N;
+    let height = x.len() / width;
     let rows = height + 1 - N;
     // Means along rows of x, t, x², t² and x·t, side by side.
     let mut across = vec![0f32; 5 * inner * height];
@@ -155,7 +156,8 @@ fn row<const N: usize>(
         let (ux, ut) = (ux[i], ut[i]);
         let variances = cov * (mxx[i] - ux * ux + mtt[i] - ut * ut) + c2;
         let covariance = 2.0 * cov * (mxt[i] - ux * ut) + c2;
-        let (light, lights) = (2.0 * ux * ut + c1, ux * ux + ut * ut + c1);
+        let light = 2.0 * ux * ut + c1;
+        let lights = ux * ux + ut * ut + c1;
         let s = light * covariance / (lights * variances);
         let by_light = 2.0 * ut / light - 2.0 * ux / lights;
         let by_structure = 2.0 * cov * (ux / variances - ut / covariance);

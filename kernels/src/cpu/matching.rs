@@ -261,7 +261,9 @@ impl Pair<'_> {
             work.line.place(&self.half, y, disparity, (2 * h, 2 * w));
             work.line.read(&self.source.half_grey, &mut work.samples[0]);
             let own = &self.reference.half_grey[2 * y * w..2 * (y + 1) * w];
-            let (valid, samples, sums) = (&work.line.valid, &work.samples[0], &mut work.sums);
+            let valid = &work.line.valid;
+            let samples = &work.samples[0];
+            let sums = &mut work.sums;
             vectorize(
                 #[inline(always)]
                 || sums.add(y / 2, [valid, own, samples], 2),

@@ -54,7 +54,8 @@ pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
         // Tasks end where a matrix does.
         let size = if cols.is_multiple_of(ROWS) { ROWS } else { cols };
         buffer.par_chunks_mut(size * rows).enumerate().for_each(|(i, block)| {
-            let (matrix, first) = (i * size / cols, i * size % cols);
+            let matrix = i * size / cols;
+            let first = i * size % cols;
             let data = &x[matrix * area + first..(matrix + 1) * area];
             let from = Mat { data, rows: size, cols: rows, row_stride: 1, col_stride: cols };
             SimdLevel::best().run(Turn { from, to: zeroed(block) });
@@ -98,7 +99,8 @@ mod tests {
 
     #[test]
     fn sums_and_stacks_are_what_they_say() {
-        let (a, b) = (numbers(2 * PART + 7), vec![0.5; 2 * PART + 7]);
+        let a = numbers(2 * PART + 7);
+        let b = vec![0.5; 2 * PART + 7];
         let got = sum(&a, &b);
         assert!(got.iter().zip(&a).all(|(got, a)| *got == a + 0.5));
         let whole = numbers(5 * PART / 2);
@@ -116,7 +118,9 @@ mod tests {
             let x = numbers(count * rows * cols);
             let got = transposed(&x, rows, cols);
             for (i, v) in got.iter().enumerate() {
-                let (m, c, r) = (i / (rows * cols), i / rows % cols, i % rows);
+                let m = i / (rows * cols);
+                let c = i / rows % cols;
+                let r = i % rows;
                 assert_eq!(*v, x[(m * rows + r) * cols + c], "{count} {rows} {cols} {i}");
             }
         }

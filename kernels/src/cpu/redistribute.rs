@@ -56,7 +56,8 @@ fn per_area<V: Vector>(areas: &[V], logits: &mut [V]) -> V {
     for &v in &logits[1..] {
         top = top.max(v);
     }
-    let (mut sum, eps) = (V::constant(0.0), V::constant(AREA_EPS));
+    let mut sum = V::constant(0.0);
+    let eps = V::constant(AREA_EPS);
     // The clamp keeps quotients inside the range of f32.
     let bounded = |a: V| (a + eps).min(V::constant(AREA_MAX));
     let first = bounded(areas[0]);
@@ -419,7 +420,8 @@ impl<T: Real> VectorKernel<T> for Backward<'_, T> {
 
 /// Computes the gradients of [`forward`] from the gradient `grad` `[P, K]` of its result.
 pub fn backward<T: Real>(args: Args<T>, grad: &[T]) -> Gradients<T> {
-    let (p, k) = (args.alphas.len(), args.k);
+    let p = args.alphas.len();
+    let k = args.k;
     let (mut logits, mut areas) = (UninitBuffer::new(p * k), UninitBuffer::new(p * k));
     let (mut alphas, mut own) = (UninitBuffer::new(p), UninitBuffer::new(p));
     type Own<'a, T> = (

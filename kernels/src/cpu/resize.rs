@@ -115,7 +115,8 @@ fn planes(r: &Resize, x: &[f32], f: impl Fn(&mut [f32]) + Sync) -> Vec<f32> {
 
 /// The gradient of [`bilinear_then`], `dx` overwritten.
 pub fn bilinear_then_backward(r: &Resize, kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
-    let (one, n) = (Bilinear::new(r), r.to[0] * r.to[1]);
+    let one = Bilinear::new(r);
+    let n = r.to[0] * r.to[1];
     let planes = x.par_chunks_exact(r.from[0] * r.from[1]).zip(dy.par_chunks_exact(n));
     let planes = planes.zip(dx.par_chunks_exact_mut(r.from[0] * r.from[1]));
     planes.for_each_init(

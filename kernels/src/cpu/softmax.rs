@@ -98,7 +98,8 @@ unsafe fn exp_part<S: Simd>(
     n: usize,
     max: S::F,
 ) -> S::F {
-    let (mut sum, whole) = (s.splat(0.0), n / LANES * LANES);
+    let mut sum = s.splat(0.0);
+    let whole = n / LANES * LANES;
     for at in (0..whole).step_by(LANES) {
         // SAFETY: 16 places inside both ranges.
         unsafe {

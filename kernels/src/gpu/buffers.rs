@@ -248,7 +248,8 @@ impl Gpu {
         };
         self.pool.begin_use(raw.size());
         let bytes = bytes.max(BINDING_BYTES_MIN).next_multiple_of(4);
-        let (pool, mapping_failed) = (self.pool.clone(), AtomicBool::new(false));
+        let pool = self.pool.clone();
+        let mapping_failed = AtomicBool::new(false);
         Ok(Buffer(Arc::new(Inner { raw, purpose, bytes, pool, mapping_failed })))
     }
 

@@ -117,7 +117,8 @@ impl Commands<'_> {
         if let Groups::Of([x, y, z]) = groups
             && x.max(y).max(z) as usize > GROUPS_MAX
         {
-            let (needed, limit) = (u64::from(x.max(y).max(z)), GROUPS_MAX as u64);
+            let needed = u64::from(x.max(y).max(z));
+            let limit = GROUPS_MAX as u64;
             return Err(GpuError::TooSmall { resource: "a dispatch, workgroups", needed, limit });
         }
         let pipeline = self.gpu.pipeline(kernel, constants)?;

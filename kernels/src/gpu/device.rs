@@ -36,7 +36,8 @@ const BINDING_MAX: u64 = 1 << 30;
 /// Returns the limits that [`Gpu::open`] requests: WebGPU's defaults with the adapter's own
 /// sizes.
 pub fn limits_of(adapter: &wgpu::Adapter) -> wgpu::Limits {
-    let (own, default) = (adapter.limits(), wgpu::Limits::default());
+    let own = adapter.limits();
+    let default = wgpu::Limits::default();
     let binding = own.max_storage_buffer_binding_size.min(BINDING_MAX);
     wgpu::Limits {
         max_storage_buffer_binding_size: binding.max(default.max_storage_buffer_binding_size),

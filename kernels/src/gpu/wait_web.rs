@@ -42,7 +42,8 @@ pub(super) fn block_on<F: Future>(future: F) -> Result<F::Output, String> {
         return Err("this program cannot wait for a GPU: set_gpu_wait was not called".to_owned());
     };
     let waker = Waker::from(Arc::new(*program));
-    let (mut context, mut future) = (Context::from_waker(&waker), pin!(future));
+    let mut context = Context::from_waker(&waker);
+    let mut future = pin!(future);
     loop {
         match future.as_mut().poll(&mut context) {
             Poll::Ready(result) => return Ok(result),

@@ -47,7 +47,8 @@ impl View {
             let principal = [k.cx, k.cy];
             let limit = std::array::from_fn(|i| {
                 let margin = JACOBIAN_MARGIN_STANDARD * 0.5 * sides[i] / focal[i];
-                let (low, high) = (principal[i] / focal[i], (sides[i] - principal[i]) / focal[i]);
+                let low = principal[i] / focal[i];
+                let high = (sides[i] - principal[i]) / focal[i];
                 (-low - margin, high + margin)
             });
             (focal, principal.map(|c| c - 0.5), limit)

@@ -82,7 +82,8 @@ impl Agreement {
         let is_behind = fit.in_front < MIN_IN_FRONT;
         let in_front = fit.in_front;
         if error_px <= LIMIT_PX && !is_behind {
-            let (accuracy, better) = (Accuracy::Precise, Vec::new());
+            let accuracy = Accuracy::Precise;
+            let better = Vec::new();
             return Self { accuracy, error_px, is_distant, in_front, better };
         }
         let mut better = better_readings(work, chosen, fit);

@@ -161,7 +161,10 @@ fn seven_point(sample: &[Match; 7]) -> Vec<DMat3> {
     let (f, g) = (from_rows(&f), from_rows(&g));
     // det(g + x·(f − g)) is a cubic in x; four values give its coefficients.
     let at = |x: f64| (g + (f - g) * x).determinant();
-    let (d0, d1, dm, d2) = (at(0.0), at(1.0), at(-1.0), at(2.0));
+    let d0 = at(0.0);
+    let d1 = at(1.0);
+    let dm = at(-1.0);
+    let d2 = at(2.0);
     let b = 0.5 * (d1 + dm) - d0;
     let a = (d2 - d0 - 4.0 * b - (d1 - dm)) / 6.0;
     let c = 0.5 * (d1 - dm) - a;

@@ -60,7 +60,8 @@ impl Matched {
 
     /// Selects the matches that agree with the cameras or with another geometry.
     fn selected(work: &WorkingPair, features: [usize; 2], matches: Vec<Match>, seed: u64) -> Self {
-        let (limit, views) = (work.limit(), TwoViews::new(&work.cameras[0], &work.cameras[1]));
+        let limit = work.limit();
+        let views = TwoViews::new(&work.cameras[0], &work.cameras[1]);
         let by_cameras: Vec<usize> = estimate::support(&views.fundamental(), &matches, limit)
             .into_iter()
             .filter(|&i| views.in_front(&matches[i], limit))

@@ -251,7 +251,8 @@ fn axes_readings(cameras: &[Camera; 2]) -> Vec<Reading> {
     for (i, signs) in (0..3).flat_map(|i| (0..4).map(move |s| (i, s))) {
         for swap in [false, true] {
             let sign = |bit: usize| if signs >> bit & 1 == 0 { 1.0 } else { -1.0 };
-            let (x, y) = (units[i] * sign(0), units[(i + if swap { 2 } else { 1 }) % 3] * sign(1));
+            let x = units[i] * sign(0);
+            let y = units[(i + if swap { 2 } else { 1 }) % 3] * sign(1);
             // Rows: the file's axes in OpenCV's.
             let file_from_camera = Mat3::from_cols(x, y, x.cross(y)).transpose();
             if x == Vec3::X && y.y.abs() == 1.0 {

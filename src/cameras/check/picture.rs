@@ -136,7 +136,8 @@ fn grid(photograph: &RgbPicture<'_>) -> Vec<DVec2> {
 
 /// Places the two halves side by side.
 fn join(a: &Half, b: &Half) -> (usize, usize, Vec<u8>) {
-    let (width, height) = (a.width + GAP + b.width, a.height.max(b.height));
+    let width = a.width + GAP + b.width;
+    let height = a.height.max(b.height);
     let mut out = vec![0u8; 3 * width * height];
     for (half, left) in [(a, 0), (b, a.width + GAP)] {
         for (y, row) in half.pixels.chunks_exact(half.width).enumerate() {

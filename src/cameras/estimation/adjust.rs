@@ -62,7 +62,8 @@ pub fn adjust_poses(photos: &[PosePhoto], cameras: &[Camera], seed: u64) -> Opti
     let moved: Vec<Absolute> = placed.iter().filter_map(|&i| adjusted.cameras[i]).collect();
     let kept: Vec<Absolute> = placed.iter().map(|&i| given[i]).collect();
     let back = Similarity::new(&moved, &kept);
-    let (mut out, mut turned_deg) = (cameras.to_vec(), 0.0f64);
+    let mut out = cameras.to_vec();
+    let mut turned_deg = 0.0f64;
     for (&photo, pose) in placed.iter().zip(&moved) {
         let (rotation, _) = back.pose(pose);
         let turn = rotation * given[photo].rotation;

@@ -132,7 +132,8 @@ impl Bundle {
         let mut focal = vec![SVector::<f64, 3>::zeros(); self.points.len()];
         let mut mixed = vec![SMatrix::<f64, 6, 3>::zeros(); self.observations.len()];
         for (o, mixed) in self.observations.iter().zip(&mut mixed) {
-            let (camera, point) = (&self.cameras[o.camera], self.points[o.point]);
+            let camera = &self.cameras[o.camera];
+            let point = self.points[o.point];
             let Some(r) = o.residual(camera, point, self.log_focal) else { continue };
             let weight = 1.0 / (1.0 + r.length_squared() / (LOSS_SCALE * LOSS_SCALE));
             let p = camera.to_camera(point);

@@ -349,7 +349,9 @@ fn judged(
 /// Standard deviations of rotation and direction, radians, and of the logarithm of the focal
 /// length.
 fn pair_deviations(estimate: &PairEstimate) -> [f64; 3] {
-    let Some(c) = estimate.refined.information.try_inverse() else { return [f64::INFINITY; 3] };
+    let Some(c) = estimate.refined.information.lu().try_inverse() else {
+        return [f64::INFINITY; 3];
+    };
     let sum = |from: usize, to: usize| (from..to).map(|i| c[(i, i)]).sum::<f64>().sqrt();
     let focal = if estimate.free_focal { sum(5, 6) } else { 0.0 };
     [sum(0, 3), sum(3, 5), focal]

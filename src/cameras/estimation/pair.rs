@@ -198,7 +198,8 @@ fn rival_of_detected(
 
 /// Indices of the matches that agree with a pose.
 fn within(r: &Refined, points: &[Bearings]) -> Vec<usize> {
-    let (e, s) = (r.relative.essential(), r.focal_scale);
+    let e = r.relative.essential();
+    let s = r.focal_scale;
     let near = |m: &Bearings| sampson(&e, &m.rescaled(s)).abs() < LIMIT;
     (0..points.len()).filter(|&i| near(&points[i])).collect()
 }
@@ -247,7 +248,8 @@ fn candidates(points: &[Bearings], prior: Option<FocalPrior>, seed: u64) -> Vec<
 
 /// Matches features along the epipolar lines of a pose, in front of both cameras.
 fn along_lines(a: &PosePhoto, b: &PosePhoto, r: &Refined) -> Vec<Pair> {
-    let (e, s) = (r.relative.essential(), r.focal_scale);
+    let e = r.relative.essential();
+    let s = r.focal_scale;
     let deviation = 0.5 * (deviations(a)[0] + deviations(b)[0]);
     let bearings =
         |i: usize, j: usize| Bearings { a: a.bearings[i], b: b.bearings[j], deviation }.rescaled(s);

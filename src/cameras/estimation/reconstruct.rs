@@ -138,7 +138,7 @@ pub(super) fn focal_scale(photos: &[PosePhoto], seed: u64) -> f64 {
         .filter_map(|(_, [i, j])| {
             let e = pair::estimate(&photos[*i], &photos[*j], false, seed).ok()?;
             let weight =
-                e.refined.information.try_inverse().map_or(0.0, |c| 1.0 / c[(5, 5)].max(1e-6));
+                e.refined.information.lu().try_inverse().map_or(0.0, |c| 1.0 / c[(5, 5)].max(1e-6));
             (e.consistent >= MIN_PAIR_INLIERS).then_some((e.refined.focal_scale, weight.sqrt()))
         })
         .collect();
@@ -245,7 +245,8 @@ pub(super) fn adjust(photos: &[PosePhoto], edges: &[Edge], given: &[Absolute]) -
         builder.triangulate();
         builder.adjust(25);
     }
-    let (cameras, points) = (builder.cameras.clone(), builder.positions.iter().flatten().count());
+    let cameras = builder.cameras.clone();
+    let points = builder.positions.iter().flatten().count();
     builder.limit = f64::INFINITY;
     let mut error = |cameras: &[Option<Absolute>]| {
         builder.cameras = cameras.to_vec();

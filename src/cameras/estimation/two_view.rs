@@ -72,7 +72,8 @@ impl Relative {
 
     /// Depths (camera z, in baselines) at which the two rays of a match are closest.
     pub(super) fn depths(&self, m: &Bearings) -> [f64; 2] {
-        let (a, b) = (self.rotation * m.a.extend(1.0), m.b.extend(1.0));
+        let a = self.rotation * m.a.extend(1.0);
+        let b = m.b.extend(1.0);
         let normal = a.cross(b);
         let n2 = normal.length_squared().max(1e-300);
         [-self.translation.cross(b).dot(normal) / n2, -self.translation.cross(a).dot(normal) / n2]

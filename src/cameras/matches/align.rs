@@ -23,8 +23,10 @@ fn sample(image: &GrayImage, p: DVec2) -> Option<[f32; 3]> {
     }
     let (i, j) = (x as usize, y as usize);
     let (u, v) = ((x - i as f64) as f32, (y - j as f64) as f32);
-    let (a, b) = (image.at(i, j), image.at(i + 1, j));
-    let (c, d) = (image.at(i, j + 1), image.at(i + 1, j + 1));
+    let a = image.at(i, j);
+    let b = image.at(i + 1, j);
+    let c = image.at(i, j + 1);
+    let d = image.at(i + 1, j + 1);
     let value = (1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d);
     let dx = (1.0 - v) * (b - a) + v * (d - c);
     let dy = (1.0 - u) * (c - a) + u * (d - b);
@@ -43,7 +45,8 @@ pub(crate) fn aligned(
     [at_a, at_b]: [DVec2; 2],
     sizes: [f64; 2],
 ) -> Option<DVec2> {
-    let (spacing, ratio) = (sizes[0].max(0.7), sizes[1] / sizes[0]);
+    let spacing = sizes[0].max(0.7);
+    let ratio = sizes[1] / sizes[0];
     let max_shift = 2.0 + sizes[1];
     let unit = spacing * f64::from(RADIUS);
     let template = template(a, at_a, spacing)?;

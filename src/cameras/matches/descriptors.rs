@@ -61,7 +61,9 @@ pub(crate) fn oriented(feature: &Feature, octaves: &[Octave]) -> Vec<Feature> {
     let top = bins.iter().fold(0.0f32, |m, &v| m.max(v));
     (0..BINS)
         .filter_map(|i| {
-            let (l, c, r) = (bins[(i + BINS - 1) % BINS], bins[i], bins[(i + 1) % BINS]);
+            let l = bins[(i + BINS - 1) % BINS];
+            let c = bins[i];
+            let r = bins[(i + 1) % BINS];
             (c >= 0.8 * top && c > l && c > r).then(|| {
                 let peak = i as f32 + 0.5 + 0.5 * (l - r) / (l - 2.0 * c + r);
                 let mut copy = feature.clone();
@@ -133,7 +135,8 @@ pub(crate) fn describe(position: &PyramidPoint, octaves: &[Octave]) -> [f32; DES
     let mut out = [0.0f32; DESCRIPTOR];
     for (i, o) in out.iter_mut().enumerate() {
         let (cell, direction) = (i / DIRECTIONS, i % DIRECTIONS);
-        let (row, column) = (cell / CELLS + 1, cell % CELLS + 1);
+        let row = cell / CELLS + 1;
+        let column = cell % CELLS + 1;
         let from = (row * RING + column) * (DIRECTIONS + 1);
         let wrapped = if direction == 0 { bins[from + DIRECTIONS] } else { 0.0 };
         *o = bins[from + direction] + wrapped;

@@ -131,9 +131,11 @@ impl GrayImage {
         let (width, height) = (2 * w, 2 * h);
         let mut pixels = vec![0.0f32; width * height];
         pixels.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
-            let (top, bottom) = (self.row(y / 2), self.row((y / 2 + y % 2).min(h - 1)));
+            let top = self.row(y / 2);
+            let bottom = self.row((y / 2 + y % 2).min(h - 1));
             for (x, o) in out.iter_mut().enumerate() {
-                let (l, r) = (x / 2, (x / 2 + x % 2).min(w - 1));
+                let l = x / 2;
+                let r = (x / 2 + x % 2).min(w - 1);
                 *o = 0.25 * (top[l] + top[r] + bottom[l] + bottom[r]);
             }
         });
@@ -188,7 +190,8 @@ fn area_weights(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let ratio = from as f64 / to as f64;
     (0..to)
         .map(|i| {
-            let (start, end) = (i as f64 * ratio, ((i + 1) as f64 * ratio).min(from as f64));
+            let start = i as f64 * ratio;
+            let end = ((i + 1) as f64 * ratio).min(from as f64);
             let first = (start.floor() as usize).min(from - 1);
             let last = (end.ceil() as usize).clamp(first + 1, from);
             let cover = |p: usize| (end.min((p + 1) as f64) - start.max(p as f64)).max(0.0);

@@ -100,7 +100,9 @@ impl TorchFile {
             let got = foreign::name(&head, length);
             return Err(Error::format(path, "a file of torch.save", got));
         };
-        let (path, opaque, checked) = (path.to_owned(), pickle.opaque, Mutex::default());
+        let path = path.to_owned();
+        let opaque = pickle.opaque;
+        let checked = Mutex::default();
         Ok(Self { path, form, root, opaque, source, checked })
     }
 

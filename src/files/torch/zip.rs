@@ -195,7 +195,8 @@ fn widened(mut fields: [u64; 3], mut extra: &[u8]) -> Option<[u64; 3]> {
         return Some(fields);
     }
     while extra.len() >= 4 {
-        let (id, size) = (number(extra, 0, 2), number(extra, 2, 2) as usize);
+        let id = number(extra, 0, 2);
+        let size = number(extra, 2, 2) as usize;
         let mut body = extra.get(4..4 + size)?;
         if id == 1 {
             for field in fields.iter_mut().filter(|f| **f == IN_ZIP64) {

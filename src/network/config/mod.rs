@@ -334,7 +334,8 @@ mod tests {
             assert!(named, "{pointer} {value}: {error}");
         };
         let huge = [1u64 << 31, 1 << 62];
-        let (mvsplat, small) = (Config::x2(), Config::small(Preset::Tuned, 2));
+        let mvsplat = Config::x2();
+        let small = Config::small(Preset::Tuned, 2);
         let both = ["/embed/dim", "/agg/n_learned", "/agg/gate_views", "/spgr/hidden"];
         let of_mvsplat = "cnn_channels/0 cnn_channels/2 transformer_layers ffn_expansion \
              window_splits depth_candidates costvolume_channels costvolume_levels \

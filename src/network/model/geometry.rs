@@ -203,7 +203,9 @@ fn left_product([w, x, y, z]: [f32; 4]) -> [f32; 16] {
 pub fn rotate(quats_wxyz: &Tensor, offsets: &Tensor) -> Result<Tensor> {
     let q = |i: usize| quats_wxyz.narrow(1, i, 1)?.unsqueeze(2);
     let v = |i: usize| offsets.narrow(2, i, 1);
-    let (w, q, v) = (q(0)?, [q(1)?, q(2)?, q(3)?], [v(0)?, v(1)?, v(2)?]);
+    let w = q(0)?;
+    let q = [q(1)?, q(2)?, q(3)?];
+    let v = [v(0)?, v(1)?, v(2)?];
     let cross = |b: &[Tensor; 3]| -> Result<[Tensor; 3]> {
         let term = |i: usize, j: usize| b[j].broadcast_mul(&q[i])?.sub(&b[i].broadcast_mul(&q[j])?);
         Ok([term(1, 2)?, term(2, 0)?, term(0, 1)?])

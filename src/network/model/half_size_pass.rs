@@ -63,7 +63,8 @@ fn quantile_range(depths: &mut [f32]) -> Option<NearFar> {
     depths.sort_unstable_by(f32::total_cmp);
     let last = depths.len().checked_sub(1)?;
     let low = (OUTLIER_SHARE * last as f32) as usize;
-    let (near, far) = (depths[low] * (1.0 - MARGIN), depths[last - low] * (1.0 + MARGIN));
+    let near = depths[low] * (1.0 - MARGIN);
+    let far = depths[last - low] * (1.0 + MARGIN);
     Some(NearFar { near, far }).filter(|range| range.is_valid())
 }
 

@@ -463,18 +463,22 @@ mod tests {
         // Linear in both indices, so bilinear interpolation is exact: 3·v + u.
         let y = resize_bilinear(&x, 5, 9)?;
         for (i, v) in y.flatten_all()?.to_vec1::<f32>()?.into_iter().enumerate() {
-            let (c, row, col) = (i / 45, i / 9 % 5, i % 9);
+            let c = i / 45;
+            let row = i / 9 % 5;
+            let col = i % 9;
             let want = 6.0 * c as f32 + 3.0 * row as f32 / 4.0 + 2.0 * col as f32 / 8.0;
             assert!((v - want).abs() < 1e-5, "{i}: {v} {want}");
         }
         assert_eq!(resize_bilinear(&x, 2, 3)?.flatten_all()?.to_vec1::<f32>()?, values(&x)?);
         assert_eq!(resize_bilinear(&x, 1, 1)?.flatten_all()?.to_vec1::<f32>()?, [0.0, 6.0]);
-        let (got, want) =
-            (resize_bilinear_then(&x, 5, 9, Activation::Gelu)?, gelu(&resize_bilinear(&x, 5, 9)?)?);
+        let got = resize_bilinear_then(&x, 5, 9, Activation::Gelu)?;
+        let want = gelu(&resize_bilinear(&x, 5, 9)?)?;
         assert_eq!(values(&got)?, values(&want)?);
         let y = upsample_nearest(&x, 3)?;
         for (i, v) in values(&y)?.into_iter().enumerate() {
-            let (c, row, col) = (i / 54, i / 9 % 6, i % 9);
+            let c = i / 54;
+            let row = i / 9 % 6;
+            let col = i % 9;
             assert_eq!(v, (6 * c + 3 * (row / 3) + col / 3) as f32);
         }
         Ok(())

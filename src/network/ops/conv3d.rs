@@ -60,7 +60,8 @@ mod tests {
             let w = Var::randn(0f32, 1.0, (o, c, 3, 3, 3), dev)?;
             let b = Var::randn(0f32, 1.0, o, dev)?;
             let weights = Tensor::randn(0f32, 1.0, (2, o, 6, 5, 7), dev)?;
-            let (one, other) = (conv3d(&x, &w, Some(&b), 1)?, by_slices(&x, &w, &b)?);
+            let one = conv3d(&x, &w, Some(&b), 1)?;
+            let other = by_slices(&x, &w, &b)?;
             let apart = |a: &Tensor, b: &Tensor| -> Result<f32> {
                 assert_eq!(a.dims(), b.dims());
                 (a - b)?.abs()?.max_all()?.to_scalar()

@@ -65,11 +65,14 @@ mod tests {
     #[test]
     fn agrees_with_the_single_ops() -> Result<()> {
         // More than a block, and one that is not full.
-        let (n, c, h) = (96 + 37, 24, 70);
+        let n = 96 + 37;
+        let c = 24;
+        let h = 70;
         let dev = &Device::Cpu;
         let noise = |shape: &[usize], s: f32| Tensor::randn(0f32, s, shape, dev);
         let (x, m) = (noise(&[n, c], 1.0)?, noise(&[n, c], 1.0)?);
-        let (up, down) = (noise(&[h, 2 * c], 0.3)?, noise(&[c, h], 0.3)?);
+        let up = noise(&[h, 2 * c], 0.3)?;
+        let down = noise(&[c, h], 0.3)?;
         let (w, b) = (noise(&[c], 1.0)?, noise(&[c], 1.0)?);
         let got = feed_forward(&x, &m, [&up, &down], [&w, &b])?;
         let hidden = Tensor::cat(&[&x, &m], 1)?.matmul(&up.t()?)?;
@@ -83,7 +86,10 @@ mod tests {
     #[test]
     fn misfits_and_gradients_are_refused() -> Result<()> {
         let zeros = |shape: &[usize]| Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu);
-        let (x, up, down, n) = (zeros(&[5, 4])?, zeros(&[6, 8])?, zeros(&[4, 6])?, zeros(&[4])?);
+        let x = zeros(&[5, 4])?;
+        let up = zeros(&[6, 8])?;
+        let down = zeros(&[4, 6])?;
+        let n = zeros(&[4])?;
         assert_eq!(feed_forward(&x, &x, [&up, &down], [&n, &n])?.dims(), [5, 4]);
         assert!(feed_forward(&x, &x, [&down, &up], [&n, &n]).is_err());
         let var = Var::zeros((5, 4), candle_core::DType::F32, &Device::Cpu)?;

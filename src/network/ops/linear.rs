@@ -140,7 +140,8 @@ fn input_grad(dy: &[f32], w: &[f32], [o, c]: [usize; 2]) -> Vec<f32> {
 /// Computes dW = dyᵀ·x `[O, C]` and db = column sums of dy `[O]`, in parts of
 /// [`GRADIENT_ROWS`] rows that are added in order.
 fn parameter_grads(x: &[f32], dy: &[f32], [o, c]: [usize; 2]) -> (Vec<f32>, Vec<f32>) {
-    let (mut dw, mut db) = (vec![0f32; o * c], vec![0f32; o]);
+    let mut dw = vec![0f32; o * c];
+    let mut db = vec![0f32; o];
     if o * c == 0 {
         return (dw, db);
     }
@@ -176,9 +177,12 @@ mod tests {
             Var::from_tensor(&Tensor::from_vec(data, shape, &Device::Cpu)?)
         };
         // One full block of rows and one that is not full.
-        let (n, c, o) = (256 + 37, 19, 11);
+        let n = 256 + 37;
+        let c = 19;
+        let o = 11;
         let x = make(n * c, 0.71, &[n, c])?;
-        let (w, b) = (make(o * c, 1.3, &[o, c])?, make(o, 2.1, &[o])?);
+        let w = make(o * c, 1.3, &[o, c])?;
+        let b = make(o, 2.1, &[o])?;
         let y = f(&x, &w, &b)?;
         let r = make(n * o, 0.37, &[n, o])?;
         let grads = (&y * r.as_tensor())?.sum_all()?.backward()?;
@@ -206,7 +210,8 @@ mod tests {
     #[test]
     fn wrong_shapes_are_errors() -> Result<()> {
         let zeros = |shape: &[usize]| Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu);
-        let (w, b) = (zeros(&[2, 3])?, zeros(&[2])?);
+        let w = zeros(&[2, 3])?;
+        let b = zeros(&[2])?;
         assert!(linear(&zeros(&[5, 4])?, &w, &b).is_err());
         assert!(linear(&zeros(&[5, 3])?, &w, &zeros(&[3])?).is_err());
         assert_eq!(linear(&zeros(&[0, 3])?, &w, &b)?.dims(), [0, 2]);

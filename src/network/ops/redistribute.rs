@@ -208,7 +208,9 @@ fn gradients_on_gpu(
     let grad = grad.contiguous()?;
     let done = borrowed::<f32, _, 4>(NAME, [logits, areas, per_parent, &grad], |[l, a, p, g]| {
         let (alphas, own) = p.split_at(parents);
-        let (rule, logits, areas) = (*rule, l, a);
+        let rule = *rule;
+        let logits = l;
+        let areas = a;
         let args = subsplat_kernels::gpu::RedistributeArgs { rule, k, logits, areas, alphas, own };
         backend.offload(|gpu| gpu.redistribute_backward(&args, g))
     })?;

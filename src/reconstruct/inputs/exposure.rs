@@ -383,7 +383,9 @@ mod tests {
         let colours: Vec<f32> = (0..144 * 3).map(|_| 110.0 + 70.0 * levels.next()).collect();
         let mut picture = Rgb::black(SIDE, SIDE);
         for (i, v) in picture.data.iter_mut().enumerate() {
-            let (x, y, c) = (i / 3 % SIDE, i / 3 / SIDE, i % 3);
+            let x = i / 3 % SIDE;
+            let y = i / 3 / SIDE;
+            let c = i % 3;
             *v = (colours[3 * (y / 8 * 12 + x / 8) + c] + noise * grain.next()).round() as u8;
         }
         picture
@@ -410,7 +412,8 @@ mod tests {
 
     #[test]
     fn gain_and_offset_are_found_among_outliers() {
-        let (gain, offset) = ([1.25, 0.9, 0.8], [4.0, -6.0, 10.0]);
+        let gain = [1.25, 0.9, 0.8];
+        let offset = [4.0, -6.0, 10.0];
         let second = cells(3.0, 5);
         let first = changed(&cells(3.0, 9), gain, offset);
         for outliers in [0.0, 0.3] {
@@ -501,7 +504,8 @@ mod tests {
         let second = cells(3.0, 5);
         let mut first = changed(&cells(3.0, 9), [0.5; 3], [0.0; 3]);
         for (i, v) in first.data.iter_mut().enumerate() {
-            let (x, y) = (i / 3 % SIDE / 8, i / 3 / SIDE / 8);
+            let x = i / 3 % SIDE / 8;
+            let y = i / 3 / SIDE / 8;
             if (x + 2 * y) % 5 < 2 {
                 *v = second.data[i];
             }

@@ -101,8 +101,10 @@ fn write_sheet(model: &Reconstructor, room: &Room, path: &Path) -> Result<()> {
     let eye = |i: usize| room.cameras[i].position();
     let mut order: Vec<usize> = (0..VIEWS).collect();
     order.sort_by(|a, b| eye(*a).distance(eye(0)).total_cmp(&eye(*b).distance(eye(0))));
-    let (two, five) = ([0, 8].map(|i| order[i]), [0, 2, 4, 6, 8].map(|i| order[i]));
-    let (view, truth) = (&room.cameras[order[5]], room.photos[order[5]].image());
+    let two = [0, 8].map(|i| order[i]);
+    let five = [0, 2, 4, 6, 8].map(|i| order[i]);
+    let view = &room.cameras[order[5]];
+    let truth = room.photos[order[5]].image();
     let drawn = [(&two[..], true), (&five[..], false), (&five[..], true)];
     let mut panels = Vec::new();
     for (views, refined) in drawn {
@@ -145,7 +147,10 @@ fn main() -> Result<()> {
         let refined = pictures(&scene(&model, &room, &all, true)?, &room);
         let fused = pictures(&scene(&model, &room, &all, false)?, &room);
         let [own, plain] = [&refined, &fused].map(|p| error(p, &room, &covered(p, &room)).0);
-        let (mut best, mut sum, mut better, mut pairs) = ([f64::INFINITY; 3], 0.0, 0, 0);
+        let mut best = [f64::INFINITY; 3];
+        let mut sum = 0.0;
+        let mut better = 0;
+        let mut pairs = 0;
         for a in 0..VIEWS {
             for b in a + 1..VIEWS {
                 let pair = pictures(&scene(&model, &room, &[a, b], false)?, &room);

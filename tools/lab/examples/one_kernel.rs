@@ -66,7 +66,8 @@ fn products(repeats: usize) -> usize {
 fn convolution(kernel: usize, stride: usize, repeats: usize) -> usize {
     let [c, o, side] = CONVOLUTION;
     let sizes = Sizes::conv2d([c, o], [kernel; 2], stride, kernel / 2, [side; 2]);
-    let (x, w) = (numbers(c * side * side, 1), numbers(o * c * kernel * kernel, 2));
+    let x = numbers(c * side * side, 1);
+    let w = numbers(o * c * kernel * kernel, 2);
     let bias = numbers(o, 3);
     for _ in 0..repeats {
         black_box(forward(SimdLevel::best(), &sizes, 1, &x, &w, &bias));

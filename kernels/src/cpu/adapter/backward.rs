@@ -51,7 +51,8 @@ impl<T: Real> VectorKernel<T> for Backward<'_, T> {
 impl<T: Real> Backward<'_, T> {
     #[inline(always)]
     fn group<V: Vector<Element = T>>(&mut self, (first, count): (usize, usize)) {
-        let (lanes, g) = (self.adapter.raw_lanes(), self.adapter.per_pixel);
+        let lanes = self.adapter.raw_lanes();
+        let g = self.adapter.per_pixel;
         let view = &self.adapter.views[self.view];
         let [raw, depths, densities] = self.inputs;
         let raw: [V; GEOMETRY] =

@@ -140,7 +140,8 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     fn run<V: Vector<Element = T>>(self) {
         let (g, d) = (self.adapter.per_pixel, self.adapter.functions);
         let n = 3 * d;
-        let (width, lanes) = (self.adapter.size[1], self.adapter.raw_lanes());
+        let width = self.adapter.size[1];
+        let lanes = self.adapter.raw_lanes();
         let turn = self.frame.turn(self.adapter, self.view);
         for first in (0..width).step_by(V::LANES) {
             let count = V::LANES.min(width - first);

@@ -183,8 +183,11 @@ fn opacity<V: Vector>(adapter: &Adapter, p: V) -> (V, V) {
     if adapter.exponent == 0.0 {
         return (p * share, share);
     }
-    let (e, one, least) = (adapter.exponent.exp2(), V::constant(1.0), V::constant(SHARE_MIN));
-    let (low, high) = (power(one - p, e), power(p, 1.0 / e));
+    let e = adapter.exponent.exp2();
+    let one = V::constant(1.0);
+    let least = V::constant(SHARE_MIN);
+    let low = power(one - p, e);
+    let high = power(p, 1.0 / e);
     let half = share * V::constant(0.5);
     let slope =
         V::constant(e) * low / (one - p).max(least) + V::constant(1.0 / e) * high / p.max(least);
@@ -216,8 +219,9 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     type Output = ();
     #[inline(always)]
     fn run<V: Vector<Element = T>>(self) {
-        let (width, lanes, g) =
-            (self.adapter.size[1], self.adapter.raw_lanes(), self.adapter.per_pixel);
+        let width = self.adapter.size[1];
+        let lanes = self.adapter.raw_lanes();
+        let g = self.adapter.per_pixel;
         let y = V::constant(self.row as f64);
         for first in (0..width).step_by(V::LANES) {
             let count = V::LANES.min(width - first);

@@ -73,7 +73,8 @@ pub fn factors<T: Real>(
     let args = Args { g, maps, query, points, grad };
     let mut d_query = vec![T::default(); query.len()];
     let mut d_points = vec![T::default(); points.len()];
-    let (q_width, p_width) = (g.query_width(), 2 * g.views * g.points_width());
+    let q_width = g.query_width();
+    let p_width = 2 * g.views * g.points_width();
     let scatters: Vec<Scatter<T>> = d_query
         .par_chunks_mut(BLOCK * q_width)
         .zip(d_points.par_chunks_mut(BLOCK * p_width))
@@ -104,7 +105,8 @@ pub fn scatter_into<T: Real>(
     (query, grad): (&[T], &[T]),
     maps: &mut [T],
 ) {
-    let (width, q_width) = (g.dim / g.groups, g.query_width());
+    let width = g.dim / g.groups;
+    let q_width = g.query_width();
     let add = |row: &mut [T], factors: &[T], from: &[T]| {
         for (i, &factor) in factors.iter().enumerate() {
             let span = i * width..(i + 1) * width;
@@ -141,7 +143,8 @@ impl<T: Real> Args<'_, T> {
         out: &mut Scatter<T>,
     ) {
         let g = self.g;
-        let (q_width, p_width) = (g.query_width(), 2 * g.views * g.points_width());
+        let q_width = g.query_width();
+        let p_width = 2 * g.views * g.points_width();
         let query = &self.query[n * q_width..(n + 1) * q_width];
         let grad = &self.grad[n * g.dim..(n + 1) * g.dim];
         scratch.place(g, &self.points[n * p_width..(n + 1) * p_width]);
@@ -211,14 +214,17 @@ impl<T: Real> Args<'_, T> {
         (d_logits, d_points): (&[T], &mut [T]),
     ) {
         let g = self.g;
-        let (one, levels) = (T::constant(1.0), g.levels.len());
+        let one = T::constant(1.0);
+        let levels = g.levels.len();
         let scale = T::constant(g.logit_scale);
         let gates = &self.query[(n + 1) * g.query_width() - g.views..(n + 1) * g.query_width()];
         for (j, sample) in scratch.samples.iter().enumerate() {
             if sample.state != State::Live {
                 continue;
             }
-            let (v, l, m) = (j / (levels * g.points), j / g.points % levels, j % g.points);
+            let v = j / (levels * g.points);
+            let l = j / g.points % levels;
+            let m = j % g.points;
             let (fx, fy) = sample.fraction;
             let (mut dx, mut dy) = (T::default(), T::default());
             for &(tap, _, corner) in &sample.corners[..sample.count] {
@@ -231,7 +237,8 @@ impl<T: Real> Args<'_, T> {
                         d_w += d_logits[ji] * scale * scratch.dots[ti];
                     }
                 }
-                let (right, below) = (corner & 1 == 1, corner >> 1 == 1);
+                let right = corner & 1 == 1;
+                let below = corner >> 1 == 1;
                 let (wx, sx) = if right { (fx, one) } else { (one - fx, -one) };
                 let (wy, sy) = if below { (fy, one) } else { (one - fy, -one) };
                 dx += d_w * sx * wy;

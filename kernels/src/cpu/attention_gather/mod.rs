@@ -119,7 +119,8 @@ impl<T: Real> Scratch<T> {
         (first_cell, first_tap): (usize, usize),
         (rx, ry): (T, T),
     ) -> Sample<T> {
-        let (zero, one) = (T::default(), T::constant(1.0));
+        let zero = T::default();
+        let one = T::constant(1.0);
         let mut s = Sample {
             state: State::Live,
             corners: [(0, zero, 0); 4],
@@ -264,7 +265,8 @@ pub fn forward_f32(g: &Gather, maps: &[f32], query: &[f32], points: &[f32], out:
 
 /// Attention output of N parents into `out` `[N, E]` (module doc).
 pub fn forward<T: Real>(g: &Gather, maps: &[T], query: &[T], points: &[T], out: &mut [T]) {
-    let (q_width, p_width) = (g.query_width(), 2 * g.views * g.points_width());
+    let q_width = g.query_width();
+    let p_width = 2 * g.views * g.points_width();
     let width = g.dim / g.groups;
     out.par_chunks_mut(BLOCK * g.dim).enumerate().for_each_init(
         Scratch::new,

@@ -35,7 +35,8 @@ pub(super) fn suits(g: &Gather) -> bool {
 
 /// As [`super::forward`].
 pub(super) fn forward(g: &Gather, maps: &[f32], query: &[f32], points: &[f32], out: &mut [f32]) {
-    let (q_width, p_width) = (g.query_width(), 2 * g.views);
+    let q_width = g.query_width();
+    let p_width = 2 * g.views;
     let key = g.key.unwrap_or(0);
     assert!(key.max(g.value) + g.dim <= g.stride, "attention gather: keys and values in a row");
     let blocks = out.par_chunks_mut(BLOCK * g.dim);
@@ -191,7 +192,8 @@ unsafe fn blend<S: Simd, const N: usize>(s: S, values: *const f32, taps: &Taps, 
     for c in (0..out.len()).step_by(N * LANES) {
         let mut sums = [s.splat(0.0); N];
         for (at, weight) in taps.at[..taps.count].iter().zip(&taps.weight) {
-            let (row, weight) = (values.wrapping_add(at + c), s.splat(*weight));
+            let row = values.wrapping_add(at + c);
+            let weight = s.splat(*weight);
             for i in 0..N {
                 // SAFETY: the caller's.
                 sums[i] = weight.fma(unsafe { lanes(s, row.add(i * LANES)) }, sums[i]);

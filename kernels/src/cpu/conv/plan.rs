@@ -89,7 +89,8 @@ impl Plan {
             let step = s.stride[a].max(1) as isize;
             let tap = |kernel: usize| {
                 let at = kernel as isize - s.padding[a] as isize;
-                let (shift, phase) = (at.div_euclid(step), at.rem_euclid(step) as usize);
+                let shift = at.div_euclid(step);
+                let phase = at.rem_euclid(step) as usize;
                 AxisTap { kernel, phase, shift }
             };
             vec![(0..s.kernel[a]).map(tap).collect()]

@@ -97,7 +97,8 @@ impl WeightGrad for Pointwise {
         let mut sums = uninit::zeros(jobs * o * c);
         sums.par_chunks_exact_mut(o * c).enumerate().for_each(|(job, sums)| {
             for unit in units * job / jobs..units * (job + 1) / jobs {
-                let (image, first) = (unit / spans, unit % spans * each);
+                let image = unit / spans;
+                let first = unit % spans * each;
                 let cols = each.min(lines - first) * width;
                 let dy = &dy[image * o * lines * width + first * width..];
                 let dy = Mat::new(dy, o, cols, lines * width);
@@ -150,7 +151,8 @@ impl Call<'_> {
     /// Computes the lines `lines` of an image's grid; any stride.
     fn strided(&self, image: usize, lines: Range<usize>) {
         let Self { level, plan, y, .. } = *self;
-        let (c, across) = (plan.src_channels, plan.grid()[2]);
+        let c = plan.src_channels;
+        let across = plan.grid()[2];
         let cols = lines.len() * across;
         let pixels = plan.src_pixels();
         let x = &self.x[image * c * pixels..][..c * pixels];
@@ -219,9 +221,11 @@ impl Kernel for PackPixels<'_> {
             for (x, row) in x.chunks_exact(pixels).zip(to.chunks_exact_mut(row_stride)) {
                 let mut at = begin;
                 while at < end {
-                    let (line, left) = (first + at / across, at % across);
+                    let line = first + at / across;
+                    let left = at % across;
                     let n = (across - left).min(end - at);
-                    let (d, h) = (line / down * step[0], line % down * step[1]);
+                    let d = line / down * step[0];
+                    let h = line % down * step[1];
                     let from = &x[(d * height + h) * width..][left * step[2]..width];
                     load_strided(s, from, step[2], &mut row[at - begin..][..n]);
                     at += n;
@@ -256,7 +260,8 @@ impl Kernel for StoreStrided<'_> {
         for (channel, sums) in sums.chunks_exact(cols).enumerate() {
             let base = (image * plan.dst_channels + channel) * depth * height * width;
             for (line, sums) in lines.clone().zip(sums.chunks_exact(across)) {
-                let (d, h) = (line / down * step[0], line % down * step[1]);
+                let d = line / down * step[0];
+                let h = line % down * step[1];
                 for z in d..(d + step[0]).min(depth) {
                     for row in h..(h + step[1]).min(height) {
                         let at = base + (z * height + row) * width;

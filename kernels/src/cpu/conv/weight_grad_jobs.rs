@@ -129,7 +129,8 @@ fn sum_jobs(algorithm: &dyn TiledWeightGrad, args: &WeightGradArgs<'_>, dw: &mut
     let &WeightGradArgs { level, plan, x, dy } = args;
     let (c, o, taps) = (plan.src_channels, plan.dst_channels, plan.kernel_taps);
     let in_pixels = plan.src_pixels();
-    let (in_image, out_image) = (c * in_pixels, o * plan.dst_pixels());
+    let in_image = c * in_pixels;
+    let out_image = o * plan.dst_pixels();
     let images = args.images();
     let partition = algorithm.partition(plan, images);
     let Partition { output_channels, input_channels, tile, images_per_tile, groups } = partition;

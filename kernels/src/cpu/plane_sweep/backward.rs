@@ -71,7 +71,8 @@ fn coefficients(s: &Sweep, r: usize, pair: &Pair, grad: &[f32]) -> Sparse {
         .map_init(
             || Walk::new(s),
             |walk, y| {
-                let (mut lengths, mut entries) = (Vec::with_capacity(w), Vec::new());
+                let mut lengths = Vec::with_capacity(w);
+                let mut entries = Vec::new();
                 for x in 0..w {
                     walk.begin(s, pair, (x, y), &s.depths[r]);
                     let first = entries.len();

@@ -108,7 +108,8 @@ struct Cell {
 
 impl Walk {
     fn new(s: &Sweep) -> Self {
-        let (d, n) = (s.candidates(), s.size[0] * s.size[1]);
+        let d = s.candidates();
+        let n = s.size[0] * s.size[1];
         Self { u: vec![0.0; d], v: vec![0.0; d], cells: vec![Cell::default(); n], pixel: 0 }
     }
 

@@ -68,7 +68,8 @@ impl Tile {
         let mut live = 0;
         for (b, block) in self.blocks.iter_mut().enumerate() {
             *block = Block::default();
-            let (x, y) = (b % BLOCKS * BLOCK, b / BLOCKS * BLOCK);
+            let x = b % BLOCKS * BLOCK;
+            let y = b / BLOCKS * BLOCK;
             for (l, t) in block.t.iter_mut().enumerate() {
                 let inside = x + l % BLOCK < width && y + l / BLOCK < height;
                 *t = if inside { 1.0 } else { -1.0 };
@@ -107,7 +108,8 @@ impl Kernel for RenderTile<'_> {
     fn run<S: Simd>(self, s: S) -> usize {
         let Self { place: Workplace { tile, batch }, t, grid, order, splats, footprints, rules } =
             self;
-        let (left, top) = (t % grid.columns * TILE, t / grid.columns * TILE);
+        let left = t % grid.columns * TILE;
+        let top = t / grid.columns * TILE;
         let mut live = tile.reset(grid.width - left, grid.height - top);
         let corner = [left as f32, top as f32];
         let mut items = 0;

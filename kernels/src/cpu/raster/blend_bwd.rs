@@ -284,7 +284,8 @@ impl Walks {
         let background = background.map(|v| s.splat(v));
         let mut live = 0u64;
         for b in 0..BLOCKS * BLOCKS {
-            let (x, y) = (b % BLOCKS * BLOCK, b / BLOCKS * BLOCK);
+            let x = b % BLOCKS * BLOCK;
+            let y = b / BLOCKS * BLOCK;
             if x >= width || y >= height {
                 continue;
             }
@@ -293,7 +294,8 @@ impl Walks {
             let mut alpha = empty;
             let first = (corner[1] + y) * grid.width + corner[0] + x;
             for r in 0..BLOCK.min(height - y) {
-                let (lane, n) = (r * BLOCK, BLOCK.min(width - x));
+                let lane = r * BLOCK;
+                let n = BLOCK.min(width - x);
                 let at = first + r * grid.width;
                 walk.t[lane..lane + n].fill(1.0);
                 let [red, green, blue, depth] = &mut walk.g;

@@ -265,7 +265,8 @@ impl Pass<'_> {
     #[inline(always)]
     pub(crate) fn parent_colours(&self, part: &mut Part, seen: &mut Directions) {
         let children = self.splats.children_per_parent();
-        let (used, set) = (self.used(), 3 * sh_coefficients(self.splats.sh_degree));
+        let used = self.used();
+        let set = 3 * sh_coefficients(self.splats.sh_degree);
         let parents = part.len.div_ceil(children);
         for first in (0..parents).step_by(GROUP) {
             let mut weighted = [[0.0f32; 3]; GROUP];
@@ -283,7 +284,8 @@ impl Pass<'_> {
                     if !self.footprints[i].visible() {
                         continue;
                     }
-                    let (gain, sums) = (gain_of(self.splats, i), self.sums_of(i));
+                    let gain = gain_of(self.splats, i);
+                    let sums = self.sums_of(i);
                     for c in 0..3 {
                         weighted[l][c] += gain * sums[6 + c];
                     }

@@ -32,8 +32,13 @@ pub(crate) fn covariance_quat<S: Simd>(
     let norm2 = w.fma(w, x.fma(x, y.fma(y, z * z)));
     let whole = s.splat(f32::MIN_POSITIVE).le(norm2) & norm2.lt(s.splat(f32::INFINITY));
     let t = s.splat(2.0) / norm2;
-    let (one, wt, xt, yt) = (s.splat(1.0), w * t, x * t, y * t);
-    let (xx, yy, zz) = (xt * x, yt * y, z * z * t);
+    let one = s.splat(1.0);
+    let wt = w * t;
+    let xt = x * t;
+    let yt = y * t;
+    let xx = xt * x;
+    let yy = yt * y;
+    let zz = z * z * t;
     let (xy, xz, yz) = (xt * y, xt * z, yt * z);
     let (wx, wy, wz) = (wt * x, wt * y, wt * z);
     // Columns of R, each times its σ.

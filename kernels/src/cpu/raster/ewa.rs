@@ -265,7 +265,8 @@ impl View {
         half: S::F,
         radius: Option<S::F>,
     ) -> (S::F, S::F) {
-        let (zero, side) = (s.splat(0.0), s.splat(self.size[axis] as f32));
+        let zero = s.splat(0.0);
+        let side = s.splat(self.size[axis] as f32);
         let half = half + s.splat(SPAN_SLACK_PX);
         let mut first = zero.max((mean - half).ceil());
         let mut past = side.min((mean + half).floor() + s.splat(1.0));

@@ -329,7 +329,8 @@ impl Chunk<'_> {
             radiance_lanes(s, self.functions, d, splats.sh, &at.map(|p| p * set))
         };
         let (gain, residual) = self.gain(s, &index);
-        let (half, infinity) = (s.splat(0.5), s.splat(f32::INFINITY));
+        let half = s.splat(0.5);
+        let infinity = s.splat(f32::INFINITY);
         let mut good = half.lt(infinity);
         for c in 0..3 {
             let v = gain.fma(sum[c], half) + residual[c];
@@ -350,7 +351,8 @@ impl Chunk<'_> {
     /// Loads γ and δ.
     #[inline(always)]
     fn gain<S: Simd>(&self, s: S, index: &[usize; LANES]) -> (S::F, [S::F; 3]) {
-        let (gain, n) = (self.splats.gain, self.splats.len());
+        let gain = self.splats.gain;
+        let n = self.splats.len();
         let none = [s.splat(0.0); 3];
         if gain.is_empty() {
             (s.splat(1.0), none)

@@ -266,7 +266,9 @@ impl Rasterizer {
         self.queue.clear();
         self.queue.extend(group.map(|t| t as u32));
         self.queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(lists.tile_len(t as usize)), t));
-        let (grid, level, queue) = (self.grid, self.level, &self.queue);
+        let grid = self.grid;
+        let level = self.level;
+        let queue = &self.queue;
         let footprints = &self.projection.footprints;
         let lists = self.lists.lists();
         let (next, items) = (AtomicUsize::new(0), AtomicUsize::new(0));
@@ -343,7 +345,8 @@ impl Kernel for PrefetchTile<'_> {
         /// Floats of a cache line.
         const LINE: usize = 16;
         let (grid, target) = (self.grid, self.target);
-        let (left, top) = (self.t % grid.columns * TILE, self.t / grid.columns * TILE);
+        let left = self.t % grid.columns * TILE;
+        let top = self.t / grid.columns * TILE;
         for y in 0..TILE.min(grid.height - top) {
             let first = (top + y) * grid.width + left;
             for x in (0..TILE).step_by(LINE) {
@@ -376,7 +379,8 @@ impl Kernel for WriteTile<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let (grid, target) = (self.grid, self.target);
-        let (left, top) = (self.t % grid.columns * TILE, self.t / grid.columns * TILE);
+        let left = self.t % grid.columns * TILE;
+        let top = self.t / grid.columns * TILE;
         let width = TILE.min(grid.width - left);
         for y in 0..TILE.min(grid.height - top) {
             let row = unfold(self.tile, y, target.background);

@@ -144,7 +144,8 @@ impl Rasterizer {
         out: &mut Gradients,
     ) {
         let upstream = Upstream { planes: gradients, background: options.background };
-        let (tiles, numbers) = (self.grid.len(), 5 * self.grid.width * self.grid.height);
+        let tiles = self.grid.len();
+        let numbers = 5 * self.grid.width * self.grid.height;
         if gradients.len() != numbers || self.projection.footprints.len() != splats.len() {
             return out.clear(splats);
         }

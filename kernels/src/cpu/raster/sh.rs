@@ -49,7 +49,9 @@ fn standard<V: Vector>(degree: usize, [x, y, z]: [V; 3]) -> [V; SH_COEFFICIENTS_
     }
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (xy, yz, xz) = (x * y, y * z, x * z);
-    let (difference, two, three) = (xx - yy, c(2.0), c(3.0));
+    let difference = xx - yy;
+    let two = c(2.0);
+    let three = c(3.0);
     b[4] = c(1.092_548_5) * xy;
     b[5] = c(-1.092_548_5) * yz;
     b[6] = c(0.315_391_57) * (two * zz - xx - yy);
@@ -58,7 +60,8 @@ fn standard<V: Vector>(degree: usize, [x, y, z]: [V; 3]) -> [V; SH_COEFFICIENTS_
     if degree == 2 {
         return b;
     }
-    let (left, right) = (three * xx - yy, xx - three * yy);
+    let left = three * xx - yy;
+    let right = xx - three * yy;
     let rest = c(4.0) * zz - xx - yy;
     b[9] = c(-0.590_043_6) * y * left;
     b[10] = c(2.890_611_4) * xy * z;
@@ -126,7 +129,10 @@ pub(crate) fn radiance_lanes<S: Simd>(
         let [r0, g0, b0, r1] = s.gather4(sh, at, 3 * c);
         let [g1, b1, r2, g2] = s.gather4(sh, at, 3 * c + 4);
         let [b2, r3, g3, b3] = s.gather4(sh, at, 3 * c + 8);
-        let (y0, y1, y2, y3) = (b[c], b[c + 1], b[c + 2], b[c + 3]);
+        let y0 = b[c];
+        let y1 = b[c + 1];
+        let y2 = b[c + 2];
+        let y3 = b[c + 3];
         rgb[0] = r3.fma(y3, r2.fma(y2, r1.fma(y1, r0.fma(y0, rgb[0]))));
         rgb[1] = g3.fma(y3, g2.fma(y2, g1.fma(y1, g0.fma(y0, rgb[1]))));
         rgb[2] = b3.fma(y3, b2.fma(y2, b1.fma(y1, b0.fma(y0, rgb[2]))));

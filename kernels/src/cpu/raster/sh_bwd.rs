@@ -64,7 +64,9 @@ fn standard<const D: usize>(x: f32, y: f32, z: f32, s: &[f32; D]) -> ([f32; D], 
         v[6] = b * (2.0 * zz - xx - yy);
         v[7] = -a * x * z;
         v[8] = e * (xx - yy);
-        let (s4, s5, s6) = (a * s[4], a * s[5], 2.0 * b * s[6]);
+        let s4 = a * s[4];
+        let s5 = a * s[5];
+        let s6 = 2.0 * b * s[6];
         let (s7, s8) = (a * s[7], 2.0 * e * s[8]);
         g[0] += s4 * y - s6 * x - s7 * z + s8 * x;
         g[1] += s4 * x - s5 * z - s6 * y - s8 * y;
@@ -83,7 +85,8 @@ fn standard<const D: usize>(x: f32, y: f32, z: f32, s: &[f32; D]) -> ([f32; D], 
         v[15] = -f * x * q;
         let (s9, s10, s11, s12) = (f * s[9], c * s[10], h * s[11], i * s[12]);
         let (s13, s14, s15) = (h * s[13], j * s[14], f * s[15]);
-        let (xy, d) = (x * y, 3.0 * (xx - yy));
+        let xy = x * y;
+        let d = 3.0 * (xx - yy);
         g[0] += s10 * y * z + 2.0 * xy * s11 - 6.0 * x * z * s12 - s13 * (w - 2.0 * xx)
             + 2.0 * x * z * s14
             - s15 * d
@@ -97,7 +100,8 @@ fn standard<const D: usize>(x: f32, y: f32, z: f32, s: &[f32; D]) -> ([f32; D], 
     }
     if D > 16 {
         let (p, q) = (3.0 * xx - yy, xx - 3.0 * yy);
-        let (xy, d) = (x * y, 3.0 * (xx - yy));
+        let xy = x * y;
+        let d = 3.0 * (xx - yy);
         let (a, b) = (7.0 * zz - 1.0, 7.0 * zz - 3.0);
         let e = 21.0 * zz - 3.0;
         v[16] = C4[0] * xy * (xx - yy);
@@ -111,7 +115,9 @@ fn standard<const D: usize>(x: f32, y: f32, z: f32, s: &[f32; D]) -> ([f32; D], 
         v[24] = C4[6] * (xx * q - yy * p);
         let (t16, t17, t18) = (C4[0] * s[16], C4[1] * s[17], C4[2] * s[18]);
         let (t19, t20, t21) = (C4[3] * s[19], C4[4] * s[20], C4[3] * s[21]);
-        let (t22, t23, t24) = (C4[5] * s[22], C4[1] * s[23], 4.0 * C4[6] * s[24]);
+        let t22 = C4[5] * s[22];
+        let t23 = C4[1] * s[23];
+        let t24 = 4.0 * C4[6] * s[24];
         let xyz = 6.0 * xy * z;
         g[0] += t16 * y * p - t17 * xyz + t18 * y * a - t21 * z * b + 2.0 * t22 * x * a
             - t23 * z * d

@@ -110,7 +110,8 @@ impl ChunkCover<'_> {
         let small = columns.len() <= 2 && rows.len() <= 2;
         let fits = columns.end <= usize::from(u16::MAX) && rows.end <= usize::from(u16::MAX);
         let mut cover = Cover { z: f.z.to_bits(), splat, ..Cover::default() };
-        let (grid, counts) = (self.grid, &mut *self.counts);
+        let grid = self.grid;
+        let counts = &mut *self.counts;
         if small && fits {
             cover.columns = [columns.start as u16, columns.end as u16];
             cover.rows = [rows.start as u16, rows.end as u16];

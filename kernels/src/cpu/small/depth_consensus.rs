@@ -115,7 +115,8 @@ impl<'a> Voter<'a> {
             return None;
         }
         let (centre, colour) = (self.surface.centre(i), self.surface.colour(i));
-        let (mut most, mut best) = (f32::NEG_INFINITY, own);
+        let mut most = f32::NEG_INFINITY;
+        let mut best = own;
         for candidate in &*candidates {
             let point = self.surface.point(centre, candidate.z);
             let supports = others.iter().map(|other| other.support(point, colour));

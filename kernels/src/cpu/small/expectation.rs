@@ -57,7 +57,8 @@ impl Expectation {
                 Err(_) => std::array::from_fn(|l| from.get(l).copied().unwrap_or(0.0)),
             }
         };
-        let (mut max, mut mode) = ([f32::NEG_INFINITY; LANES], [0f32; LANES]);
+        let mut max = [f32::NEG_INFINITY; LANES];
+        let mut mode = [0f32; LANES];
         for k in 0..d {
             let x = row(k);
             for l in 0..LANES {
@@ -87,7 +88,8 @@ impl Expectation {
                 MeanOver::Window => first_near[l] / near[l],
                 MeanOver::All => first[l] * inverse,
             };
-            let (mean, mass) = (mode[l] + away, near[l] * inverse);
+            let mean = mode[l] + away;
+            let mass = near[l] * inverse;
             Pixel { max: max[l], inverse, mode: mode[l], mean, mass }
         })
     }
@@ -130,7 +132,8 @@ pub fn backward(e: &Expectation, logits: &[f32], grad: &[f32], out: &mut [f32]) 
     // dp/dlogit: p·(c_k − Σ p·c), c_k the gradient with respect to p_k.
     let reach = e.window as f32 + 0.5;
     out.par_chunks_exact_mut(n).enumerate().for_each(|(plane, out)| {
-        let (b, k) = (plane / d, (plane % d) as f32);
+        let b = plane / d;
+        let k = (plane % d) as f32;
         let (pixels, x) = (&pixels[b * n..(b + 1) * n], &logits[plane * n..(plane + 1) * n]);
         let grads = d_means[b * n..(b + 1) * n].iter().zip(&d_masses[b * n..(b + 1) * n]);
         vectorize(

@@ -42,7 +42,8 @@ impl Input {
         let small = self.resize.from[0] * self.resize.from[1];
         let up = Bilinear::new(&self.resize);
         y.par_chunks_exact_mut(n).enumerate().for_each_init(Vec::new, |wide, (i, y)| {
-            let (b, p) = (i / (c + BESIDE), i % (c + BESIDE));
+            let b = i / (c + BESIDE);
+            let p = i % (c + BESIDE);
             match p.checked_sub(c) {
                 None => up.plane(&features[(b * c + p) * small..][..small], y, wide),
                 Some(k @ 0..3) => y.copy_from_slice(&rgb[(b * 3 + k) * n..][..n]),
@@ -126,7 +127,8 @@ impl Output {
         raw.par_chunks_exact_mut(r * w).enumerate().for_each(|(i, rows)| {
             let (b, y) = (i / h, i % h);
             for (j, rows) in rows.chunks_mut(PIXELS * r).enumerate() {
-                let (at, count) = (y * w + j * PIXELS, rows.len() / r);
+                let at = y * w + j * PIXELS;
+                let count = rows.len() / r;
                 let data = &x[b * (r + 1) * n + at..];
                 let from = Mat { data, rows: count, cols: r, row_stride: 1, col_stride: n };
                 SimdLevel::best().run(Turn { from, to: rows });
@@ -148,7 +150,8 @@ impl Output {
     pub fn opacity(&self, x: &[f32], confidence: &[f32], y: &mut [f32]) {
         let (n, r) = (self.plane(), self.raw);
         y.par_chunks_exact_mut(n).enumerate().for_each(|(b, y)| {
-            let (x, c) = (&x[(b * (r + 1) + r) * n..][..n], &confidence[b * n..][..n]);
+            let x = &x[(b * (r + 1) + r) * n..][..n];
+            let c = &confidence[b * n..][..n];
             vectorize(
                 #[inline(always)]
                 || {
@@ -173,7 +176,8 @@ impl Output {
         let (n, r) = (self.plane(), self.raw);
         let mut d_logit = vec![0f32; d_opacity.len()];
         d_logit.par_chunks_exact_mut(n).enumerate().for_each(|(b, d)| {
-            let (x, c) = (&x[(b * (r + 1) + r) * n..][..n], &confidence[b * n..][..n]);
+            let x = &x[(b * (r + 1) + r) * n..][..n];
+            let c = &confidence[b * n..][..n];
             let g = &d_opacity[b * n..][..n];
             vectorize(
                 #[inline(always)]

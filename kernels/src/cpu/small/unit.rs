@@ -31,7 +31,8 @@ pub fn forward(channels: usize, n: usize, x: &[f32], y: &mut [f32]) {
                     let scale = &mut scale[..PIXELS.min(n - at)];
                     inverse(channels, n, x, at, scale);
                     for c in 0..channels {
-                        let (from, to) = (c * n + at, c * n + at + scale.len());
+                        let from = c * n + at;
+                        let to = c * n + at + scale.len();
                         for ((y, x), s) in y[from..to].iter_mut().zip(&x[from..to]).zip(&*scale) {
                             *y = x * s;
                         }

@@ -166,7 +166,8 @@ impl<T: Real> Table<T> {
         if rules.primary_view == PrimaryView::Source || self.len() == 1 {
             return self.views(&source);
         }
-        let (mut nearest, mut best) = (V::constant(f64::INFINITY), V::constant(-1.0));
+        let mut nearest = V::constant(f64::INFINITY);
+        let mut best = V::constant(-1.0);
         for (v, camera) in self.cameras.iter().enumerate() {
             let view = View::new(splat(camera));
             let p = view.seen_from(mean);

@@ -141,7 +141,8 @@ impl Array {
         call: AdapterCall,
     ) -> Result<Self, GpuError> {
         call.check(ADAPTER_COLOURS.name, self)?;
-        let (n, d) = (call.pixels() * call.per_pixel, call.functions);
+        let n = call.pixels() * call.per_pixel;
+        let d = call.functions;
         let lengths = [("matrices", matrices.len(), call.views * d * d)];
         GpuError::check_lengths(ADAPTER_COLOURS.name, lengths)?;
         let result = self.recorder.empty(&if interleaved { [n, d, 3] } else { [n, 3, d] })?;

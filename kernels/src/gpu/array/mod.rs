@@ -246,7 +246,8 @@ impl Recorder {
         let (calls, before) = std::mem::take(&mut *pending);
         let mut commands = self.gpu.resume(NAME, calls);
         let result = f(&mut commands)?;
-        let (calls, bytes) = (commands.suspend(), before + bytes);
+        let calls = commands.suspend();
+        let bytes = before + bytes;
         if calls.len() < CALLS_MAX && bytes < BYTES_MAX {
             *pending = (calls, bytes);
             return Ok(result);

@@ -194,7 +194,8 @@ impl Array {
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
     pub fn pooled_backward(&self, s: usize, dims: &[usize]) -> Result<Self, GpuError> {
-        let (rank, planes) = (dims.len(), self.dims.iter().rev().skip(2).product());
+        let rank = dims.len();
+        let planes = self.dims.iter().rev().skip(2).product();
         let (h, w) = match self.dims.as_slice() {
             &[.., h, w] if rank >= 2 => (h, w),
             _ => return Err(misfit("pool", "[.., h, w]".to_owned(), &self.dims)),

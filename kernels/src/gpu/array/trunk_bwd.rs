@@ -77,7 +77,8 @@ impl Array {
             d_head.binding(),
             d_parents.binding(),
         ];
-        let (uniform, groups) = (args.uniform(&(0..n)), Groups::of(n, THREADS));
+        let uniform = args.uniform(&(0..n));
+        let groups = Groups::of(n, THREADS);
         self.recorder.call(&SPGR_BWD, &[], &uniform, &bindings, groups)?;
         let of_gains = self.recorder.empty(&self.dims)?;
         let uniform = SpgrGainsBwdUniform {

@@ -133,7 +133,8 @@ impl Array {
         let gpu = recorder.gpu();
         let cells = self.count() / gather.stride.max(1);
         let samples = n * gather.samples();
-        let (width, row) = (gather.query_width(), gather.query_width() + args.points_row());
+        let width = gather.query_width();
+        let row = gather.query_width() + args.points_row();
         let mut uniform = args.uniform(&(0..n));
         uniform.cells = cells as u32;
         let uniform = gpu.uniform(&uniform)?;

@@ -51,7 +51,8 @@ impl<'a> PlaneSweepArgs<'a> {
 
     /// Checks the arguments and returns R.
     pub(in crate::gpu) fn check(&self) -> Result<usize, GpuError> {
-        let (s, features) = (self.sweep, self.features());
+        let s = self.sweep;
+        let features = self.features();
         let rows = s.pairs.len();
         let sources = s.pairs.iter().flatten().map(|p| p.source + 1).max().unwrap_or(0);
         let ragged = s.depths.iter().find(|d| d.len() != s.candidates());

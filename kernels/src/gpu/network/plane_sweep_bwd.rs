@@ -135,7 +135,8 @@ impl Array {
             ("gradient", grad.count(), rows * sweep.candidates() * args.plane()),
         ];
         GpuError::check_lengths(PLANE_SWEEP_TAPS.name, lengths)?;
-        let (recorder, all) = (self.recorder(), 0..rows);
+        let recorder = self.recorder();
+        let all = 0..rows;
         let gpu = recorder.gpu();
         let (pairs, starts) = args.tables(&all);
         let sources = source.count() / features.max(1);

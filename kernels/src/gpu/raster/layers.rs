@@ -67,7 +67,8 @@ pub(crate) fn bands(
     let row = floats_per_pixel * TILE_GPU * whole.width as usize;
     let max_rows = gpu.rows_per_binding(row);
     if max_rows == 0 {
-        let (needed, limit) = (row as u64, gpu.rows_per_binding(1) as u64);
+        let needed = row as u64;
+        let limit = gpu.rows_per_binding(1) as u64;
         return Err(GpuError::TooSmall { resource: "a row of tiles, floats", needed, limit });
     }
     let band = |rows: std::ops::Range<usize>| {
@@ -90,7 +91,9 @@ fn cut(offsets: &[u32], total: u32, limits: LayerLimits) -> Result<Vec<Layer>, G
     // Splats after the last pair intersect no tile.
     let drawn = offsets.partition_point(|&o| o < total);
     let ends: Vec<u32> = offsets.iter().take(drawn).skip(1).copied().chain([total]).collect();
-    let (mut layers, mut place, mut first) = (Vec::new(), 0, 0);
+    let mut layers = Vec::new();
+    let mut place = 0;
+    let mut first = 0;
     while place < drawn {
         let candidates = ends.get(place..(place + limits.splats).min(drawn)).unwrap_or(&[]);
         let count = candidates.partition_point(|&end| (end - first) as usize <= limits.pairs);
@@ -129,7 +132,8 @@ impl Band {
         words_per_pair: usize,
         timed: bool,
     ) -> Result<Self, GpuError> {
-        let (n, limit) = (scene.len, gpu.rows_per_binding(1));
+        let n = scene.len;
+        let limit = gpu.rows_per_binding(1);
         if n > limit {
             let (needed, limit) = (n as u64, limit as u64);
             return Err(GpuError::TooSmall { resource: "splats", needed, limit });
@@ -148,7 +152,8 @@ impl Band {
         let total = plan.get(PLAN_REQUESTED).copied().unwrap_or(u32::MAX);
         // The prefix sums saturate at this value (wgsl/shared/scan.wgsl).
         if total == u32::MAX {
-            let (needed, limit) = (u64::from(total), u64::from(total - 1));
+            let needed = u64::from(total);
+            let limit = u64::from(total - 1);
             return Err(GpuError::TooSmall { resource: "(splat, tile) pairs", needed, limit });
         }
         let limits = LayerLimits {
@@ -223,7 +228,9 @@ impl Rasterizer {
         mut end: impl FnMut(&mut Commands, &RasterUniform, &Buffer) -> Result<R, GpuError>,
     ) -> Result<Vec<(RasterUniform, R)>, GpuError> {
         let gpu = self.gpu().clone();
-        let (mut ends, mut times, mut pairs) = (Vec::new(), Times::new(), 0);
+        let mut ends = Vec::new();
+        let mut times = Times::new();
+        let mut pairs = 0;
         for call in bands(&gpu, whole, PICTURE_CHANNELS)? {
             let band = Band::open(&gpu, scene, call, 1, self.timed)?;
             let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&call))?;
@@ -256,7 +263,8 @@ impl Rasterizer {
         let mut out = vec![0.0; PICTURE_CHANNELS * all];
         let planes: &[usize] = if whole.step == 1 { &[1; PICTURE_CHANNELS] } else { &[3, 1, 1] };
         for (call, picture) in bands {
-            let (own, first) = (pixels(&call), call.top as usize * TILE_GPU * call.width as usize);
+            let own = pixels(&call);
+            let first = call.top as usize * TILE_GPU * call.width as usize;
             let picture = picture.take(self.gpu())?;
             let mut rest = &picture[..];
             let mut channel = 0;

@@ -102,8 +102,12 @@ impl Rasterizer {
     ) -> Result<(Vec<f32>, Frame), GpuError> {
         let scene = self.gpu().upload_splats(splats)?;
         let rendered = self.render_frame(&scene, camera, options, Channels::Planes)?;
-        let (gpu, pairs, timed) = (self.gpu().clone(), self.pairs(), self.timed);
-        let (call, buffers, times) = (rendered.call, rendered.buffers, Times::new());
+        let gpu = self.gpu().clone();
+        let pairs = self.pairs();
+        let timed = self.timed;
+        let call = rendered.call;
+        let buffers = rendered.buffers;
+        let times = Times::new();
         Ok((rendered.picture, Frame { gpu, scene, call, buffers, pairs, timed, times }))
     }
 
@@ -344,7 +348,8 @@ impl Frame {
 /// Returns the gradients of a band's pixels `[6, rows, W]`: its rows of `whole` `[5, H, W]`, and
 /// space for the transmittance.
 fn band_gradients(whole: &[f32], call: &RasterUniform) -> Vec<f32> {
-    let (plane, own) = ((call.width * call.height) as usize, pixels(call));
+    let plane = (call.width * call.height) as usize;
+    let own = pixels(call);
     let first = call.top as usize * TILE_GPU * call.width as usize;
     let mut out = Vec::with_capacity(LAYER_CHANNELS * own);
     for plane in whole.chunks_exact(plane.max(1)) {

@@ -69,7 +69,8 @@ impl Scene {
         let Some(sh_degree) = (0..=SH_DEGREE_MAX).find(|l| sh_coefficients(*l) == d) else {
             return misfit("sh", "1, 4, 9, 16 or 25 functions".to_owned(), d.to_string());
         };
-        let (mut first, mut own) = (0, Vec::with_capacity(parts.len()));
+        let mut first = 0;
+        let mut own = Vec::with_capacity(parts.len());
         for part in parts {
             let (rows, sh) = (part.rows.dims(), part.sh.dims());
             let count = rows.first().copied().unwrap_or(0);
@@ -152,7 +153,8 @@ impl Gpu {
             Ok::<_, GpuError>(Binding::from(&self.upload("splats", own)?))
         };
         let parts = Self::chunks(n.div_ceil(children), max_parents).map(|parents| {
-            let (first, past) = (parents.start * children, (parents.end * children).min(n));
+            let first = parents.start * children;
+            let past = (parents.end * children).min(n);
             Ok(Part {
                 first,
                 count: past - first,

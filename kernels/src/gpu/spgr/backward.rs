@@ -83,7 +83,8 @@ impl Gpu {
         head: &[f32],
         grad: &[f32],
     ) -> Result<Vec<f32>, GpuError> {
-        let (records, gain_stride) = (head.len() / HEAD_STRIDE, rules.gain_channels());
+        let records = head.len() / HEAD_STRIDE;
+        let gain_stride = rules.gain_channels();
         let lengths = [
             ("head records", head.len(), records * HEAD_STRIDE),
             ("gradient of the gains", grad.len(), records * gain_stride),

@@ -51,7 +51,8 @@ pub struct RedistributeArgs<'a> {
 impl RedistributeArgs<'_> {
     /// Checks the lengths.
     fn check(&self) -> Result<(), GpuError> {
-        let (p, k) = (self.alphas.len(), self.k);
+        let p = self.alphas.len();
+        let k = self.k;
         let own = if self.rule.areas_are_relative() { p } else { self.own.len() };
         let lengths = [
             ("logits", self.logits.len(), p * k),
@@ -140,7 +141,8 @@ impl Gpu {
         let mut out = RedistributeGradients::default();
         for parents in Self::chunks(args.alphas.len(), self.rows_per_binding(args.k.max(2))) {
             let mut bindings = args.upload(self, &parents)?;
-            let (p, count) = (parents.len(), parents.len() * args.k);
+            let p = parents.len();
+            let count = parents.len() * args.k;
             let grad = part(grad, &(parents.start * args.k..parents.end * args.k));
             let grad = self.upload("gradient of opacities", grad)?;
             let logits = self.empty::<f32>("gradient of logits", count)?;

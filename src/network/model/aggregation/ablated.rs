@@ -314,7 +314,9 @@ impl Stage {
         q: &Tensor,
     ) -> Result<Tensor> {
         let n = q.dim(0)?;
-        let (v, l, m) = (g.views, g.levels.len(), g.points);
+        let v = g.views;
+        let l = g.levels.len();
+        let m = g.points;
         let width = v * l * m * keys.groups;
         let bias = match (&self.weights, &self.level_bias) {
             (Some(weights), _) => affine(weights, q)?.narrow(1, 0, width)?,

@@ -394,6 +394,7 @@ fn widths(levels: &[FeatureLevel], channels: &[(FeatureLevel, usize)]) -> Result
 fn visibility<A: Array>(prepared: &Prepared<A>, centres: &A, depth: &A) -> Result<Option<A>> {
     let Some(maps) = &prepared.depths else { return Ok(None) };
     let [n, v, _] = depth.sizes()?;
-    let (centres, depth) = (centres.reshape((n, v, 2))?, depth.reshape((n, v))?);
+    let centres = centres.reshape((n, v, 2))?;
+    let depth = depth.reshape((n, v))?;
     centres.occlusion_gate(&depth, maps).map(Some)
 }

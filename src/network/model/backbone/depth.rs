@@ -93,7 +93,9 @@ impl DepthPredictor {
     /// # Errors
     /// A tensor is missing or has another shape.
     pub fn new(s: &Settings, vb: VarBuilder) -> Result<Self> {
-        let (c, d, r) = (s.cnn_channels[2], s.depth_candidates, s.refine_channels);
+        let c = s.cnn_channels[2];
+        let d = s.depth_candidates;
+        let r = s.refine_channels;
         let g = s.gaussians_per_pixel;
         let raw = 2 + 7 + 3 * sh_coefficients(s.primaries.sh_degree);
         let refine = vb.pp("refine_unet");

@@ -432,7 +432,9 @@ impl SmallBackbone {
         let (mut raws, mut densities, mut hiddens) = (Vec::new(), Vec::new(), Vec::new());
         for i in (0..views).step_by(step) {
             let part = |t: &A| if step == views { Ok(t.clone()) } else { t.narrow(0, i, 1) };
-            let (rgb, index, confidence) = (part(rgb)?, part(sides[0])?, part(sides[1])?);
+            let rgb = part(rgb)?;
+            let index = part(sides[0])?;
+            let confidence = part(sides[1])?;
             let input = part(&projected)?.head_input(&rgb, [&index, &confidence], share)?;
             let hidden = self.head1.forward_then(&input, Activation::Gelu)?;
             drop(input);
@@ -556,7 +558,8 @@ fn candidates(views: &Views, d: usize) -> Vec<Vec<Vec<f32>>> {
 fn ray_lengths(camera: &Camera) -> Vec<f32> {
     let k = camera.intrinsics();
     let at = |i: usize| {
-        let (x, y) = ((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
+        let x = (i % k.width) as f32 + 0.5;
+        let y = (i / k.width) as f32 + 0.5;
         k.unproject(glam::Vec2::new(x, y)).length()
     };
     (0..k.width * k.height).map(at).collect()

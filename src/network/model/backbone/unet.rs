@@ -58,7 +58,8 @@ impl UNet {
         }
         let mut up = Vec::new();
         for i in 0..2 * levels {
-            let (lowest, top) = (i / 2 == 0, i / 2 + 1 == levels);
+            let lowest = i / 2 == 0;
+            let top = i / 2 + 1 == levels;
             let vb = vb.pp(format!("output_blocks.{i}"));
             let grow = i % 2 == 1 && !top;
             let vb_grow = vb.pp(if lowest { "2.conv" } else { "1.conv" });

@@ -263,7 +263,8 @@ fn assembled(parents: &Splats, counts: &[u8], groups: &[Group], made: &[Made]) -
     for (group, (made_rows, made_gains)) in groups.iter().zip(made) {
         let k = group.children;
         for (i, parent) in group.indices.iter().map(|p| *p as usize).enumerate() {
-            let (begin, end) = (starts[parent], starts[parent] + k);
+            let begin = starts[parent];
+            let end = starts[parent] + k;
             let own = &mut rows[begin * SPLAT_STRIDE..end * SPLAT_STRIDE];
             if k == 1 {
                 own.copy_from_slice(parents.row(parent));

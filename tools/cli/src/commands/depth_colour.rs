@@ -43,7 +43,8 @@ pub fn colour_depth(depth: &Depth) -> Rgb {
         }
     }
     let (margin, text) = (MARGIN * scale, HEIGHT * scale);
-    let (top, rows) = (margin + text / 2, depth.height.saturating_sub(2 * margin + text).max(1));
+    let top = margin + text / 2;
+    let rows = depth.height.saturating_sub(2 * margin + text).max(1);
     for y in 0..rows {
         let share = y as f32 / (rows.max(2) - 1) as f32;
         for x in 0..BAR * scale {

@@ -102,7 +102,8 @@ pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
             catmull_rom([p(k_signed - 1), p(k_signed), p(k_signed + 1), p(k_signed + 2)], f);
         let turn = |i: usize| Quat::from_mat3(&through[i].rotation());
         let rotation = turn(k).slerp(turn(k + 1), f);
-        let (a, b) = (through[k].intrinsics(), through[k + 1].intrinsics());
+        let a = through[k].intrinsics();
+        let b = through[k + 1].intrinsics();
         let mut intrinsics = a;
         let b = b.resized(a.width, a.height);
         intrinsics.fx += f * (b.fx - a.fx);

@@ -66,7 +66,8 @@ fn load_default(args: &ModelRequest) -> Result<Reconstructor> {
     if args.seed.is_none() && !mvsplat && args.model.config.is_none() {
         return shipped(args);
     }
-    let (config, seed) = (config(args, None)?, args.seed.unwrap_or(0));
+    let config = config(args, None)?;
+    let seed = args.seed.unwrap_or(0);
     let effect = if is_mvsplat(&config) {
         "pictures will be noise"
     } else {

@@ -46,7 +46,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);
     let model = progress.stage("model", |_| model::load(&request))?.with_backend(&backend);
-    let (source, target, context) = (&args.source, args.target_size(), &plan.context);
+    let source = &args.source;
+    let target = args.target_size();
+    let context = &plan.context;
     let (size, (w, h)) = reconstruct::input_size(source, target, &model, &plan.scene, context)?;
     let model = reconstruct::with_children(source, target, model, context.len(), (w, h))?;
     (plan.options.input_size, plan.options.target_size) = (size, target);
@@ -54,7 +56,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let target_size = (width, height);
     let targets = targets(args, &plan, target_size)?;
     memory::check_picture("the picture size", target_size)?;
-    let (inputs, upscale) = (plan.context.len(), model.config().upscale);
+    let inputs = plan.context.len();
+    let upscale = model.config().upscale;
     let count = plan.options.density.limit(inputs * w * h, inputs, upscale) as u64;
     let degree = model.config().primaries().sh_degree;
     output::check_formats(args, count, degree)?;

@@ -69,9 +69,12 @@ fn growth(splats: &Splats, bounds: &Bounds) -> Option<Vec3> {
     let count = all().count() as f64;
     let (sum, sizes) = all().fold((DVec3::ZERO, 0.0), |(p, s), (q, t)| (p + q.as_dvec3(), s + t));
     let (centre, mean) = (sum / count, sizes / count);
-    let (mut spread, mut along, mut variance) = (DMat3::ZERO, DVec3::ZERO, 0.0);
+    let mut spread = DMat3::ZERO;
+    let mut along = DVec3::ZERO;
+    let mut variance = 0.0;
     for (p, size) in all() {
-        let (p, size) = (p.as_dvec3() - centre, size - mean);
+        let p = p.as_dvec3() - centre;
+        let size = size - mean;
         spread += DMat3::from_cols(p * p.x, p * p.y, p * p.z);
         along += p * size;
         variance += size * size;
@@ -91,7 +94,8 @@ mod tests {
     /// Points on a wall 4 units before a camera at the origin that looks along `forward`, and on a
     /// box 2 units before it; σ is a hundredth of the distance.
     fn scene(forward: Vec3, right: Vec3) -> Splats {
-        let (down, mut rows) = (forward.cross(right), Vec::new());
+        let down = forward.cross(right);
+        let mut rows = Vec::new();
         for (distance, count) in [(4.0, 20), (2.0, 8)] {
             for i in 0..count * count {
                 let at = |n: usize| (n as f32 / (count - 1) as f32 - 0.5) * 0.2 * count as f32;

@@ -98,7 +98,8 @@ pub fn convert(bytes: Vec<u8>, from: Float, to: Float) -> Result<Vec<u8>, Reject
     for (i, element) in elements.enumerate() {
         let v = from.decode(element);
         if !v.is_finite() {
-            let (expected, got) = ("finite numbers".to_owned(), format!("{v} at element {i}"));
+            let expected = "finite numbers".to_owned();
+            let got = format!("{v} at element {i}");
             return Err(Rejected { expected, got });
         }
         if !same && !to.encode(v, &mut out) {

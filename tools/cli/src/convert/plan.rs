@@ -187,7 +187,8 @@ impl Plan {
             bail!("{file}: expected names of kind {kind} such as `{such}`, got others{like}");
         }
         if args.strict && !self.unexpected.is_empty() {
-            let (n, first) = (self.unexpected.len(), first(&self.unexpected));
+            let n = self.unexpected.len();
+            let first = first(&self.unexpected);
             bail!(
                 "{file}: expected the names of kind {kind} alone, got {n} others, first `{first}`"
             );

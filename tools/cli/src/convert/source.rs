@@ -210,7 +210,9 @@ fn is_safetensors(path: &Path) -> Result<bool> {
 /// Computes length and SHA-256 of a file, in lower-case hexadecimal.
 fn hash(path: &Path) -> Result<(u64, String)> {
     let mut file = std::fs::File::open(path).with_context(|| path.display().to_string())?;
-    let (mut hasher, mut total, mut chunk) = (Sha256::new(), 0, vec![0; CHUNK]);
+    let mut hasher = Sha256::new();
+    let mut total = 0;
+    let mut chunk = vec![0; CHUNK];
     loop {
         let n = file.read(&mut chunk).with_context(|| path.display().to_string())?;
         let Some(read) = chunk.get(..n).filter(|r| !r.is_empty()) else { break };

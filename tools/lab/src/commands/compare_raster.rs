@@ -94,7 +94,9 @@ pub fn compare(case: &Case, level: SimdLevel) -> Result<Comparison> {
 /// # Errors
 /// As [`compare`]; the device fails.
 pub fn compare_on(case: &Case, renderer: &mut Renderer) -> Result<Comparison> {
-    let (splats, camera, options) = (case.splats(), &case.camera, &case.options);
+    let splats = case.splats();
+    let camera = &case.camera;
+    let options = &case.options;
     let got = renderer.render_slices(&splats, camera, options)?;
     let mut comparison = picture(case, &got)?;
     let references = gradient_references(case, &mut comparison)?;

@@ -165,7 +165,8 @@ impl Meta<'_> {
 
     /// Refuses a case that was made with another value of a constant of ours.
     fn constant(&self, key: &str, ours: f32) -> Result<()> {
-        let (theirs, ours) = (self.number::<f64>(key)?, f64::from(ours));
+        let theirs = self.number::<f64>(key)?;
+        let ours = f64::from(ours);
         let same = (theirs - ours).abs() <= CONSTANT_TOLERANCE * ours;
         ensure!(same, "metadata `{key}`: expected {ours} under this convention, got {theirs}");
         Ok(())

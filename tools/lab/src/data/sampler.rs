@@ -173,7 +173,9 @@ mod tests {
     #[test]
     fn targets_lie_between_the_contexts_with_both_ends() {
         let sampler = ViewSampler { targets: 4, ..ViewSampler::constant(3, 3, 4) };
-        let (mut ends, mut doubles, mut lefts) = ([false; 2], false, [false; 7]);
+        let mut ends = [false; 2];
+        let mut doubles = false;
+        let mut lefts = [false; 7];
         for seed in 0..500 {
             let sampled = sampler.sample(10, 0, seed).unwrap();
             let [left, right] = sampled.context;

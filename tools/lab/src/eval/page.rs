@@ -70,8 +70,8 @@ pub fn busiest(truth: &Rgb, side: usize) -> (usize, usize, usize, usize) {
     let mut best = (-1.0, (0, 0, w, h));
     for i in 0..CANDIDATES * CANDIDATES {
         let at = |space: usize, k: usize| space * k / (CANDIDATES - 1);
-        let (left, top) =
-            (at(truth.width - w, i % CANDIDATES), at(truth.height - h, i / CANDIDATES));
+        let left = at(truth.width - w, i % CANDIDATES);
+        let top = at(truth.height - h, i / CANDIDATES);
         let Some(window) = truth.window(left, top, w, h) else { continue };
         let detail = mean_gradient(&window.to_unit(), w, h).unwrap_or(0.0);
         if detail > best.0 {

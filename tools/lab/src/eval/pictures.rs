@@ -188,7 +188,8 @@ impl<'a> PictureMaker<'a> {
         crops: &Crops,
         sets: &[Set],
     ) -> Result<SceneChildren> {
-        let (inputs, upscale) = (&crops.inputs, network.model.config().upscale);
+        let inputs = &crops.inputs;
+        let upscale = network.model.config().upscale;
         let raster = self.raster_options(network, self.upscale, None);
         let mut renderer = Renderer::default();
         for set in sets {
@@ -239,7 +240,8 @@ impl<'a> PictureMaker<'a> {
 
     /// The picture of `method` at a target, of the current Gaussians: RGB, display values.
     pub(super) fn picture(&mut self, method: &Method, crops: &Crops, target: &Cropped) -> Vec<f32> {
-        let (r, camera) = (self.upscale, &target.target_camera);
+        let r = self.upscale;
+        let camera = &target.target_camera;
         let size = (target.target.width, target.target.height);
         match method {
             Method::Copy => nearest(&crops.inputs, camera, size),

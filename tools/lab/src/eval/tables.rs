@@ -94,10 +94,12 @@ pub fn targets_csv(scores: &Scores) -> String {
     let mut text = format!("scene,context,target,frame,method,{COLUMNS}\n");
     for case in &scores.cases {
         let context: Vec<String> = case.context.iter().map(usize::to_string).collect();
-        let (scene, context) = (quoted(&case.scene), context.join(" "));
+        let scene = quoted(&case.scene);
+        let context = context.join(" ");
         for t in &case.targets {
             for (method, score) in scores.methods.iter().zip(&t.scores) {
-                let (name, figures) = (quoted(&t.name), figures(score));
+                let name = quoted(&t.name);
+                let figures = figures(score);
                 // Writing to a String does not fail.
                 let _ = writeln!(text, "{scene},{context},{},{name},{method},{figures}", t.frame);
             }

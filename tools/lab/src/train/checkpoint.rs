@@ -81,7 +81,8 @@ pub fn save(
     ]);
     let (mut specs, mut data) = (Vec::new(), Vec::new());
     for (name, tensor) in state {
-        let (name, shape) = (name.clone(), tensor.dims().to_vec());
+        let name = name.clone();
+        let shape = tensor.dims().to_vec();
         specs.push(TensorSpec { name, dtype: Dtype::F32, shape });
         data.push(tensor.flatten_all()?.to_vec1::<f32>()?);
     }

@@ -512,7 +512,8 @@ impl TrainConfig {
         let sizes = &self.data.sizes;
         let any = config.spgr.enabled && config.spgr.head.serves_any_k();
         for size in sizes {
-            let (r, fits) = (size.upscale, any || size.upscale == config.upscale);
+            let r = size.upscale;
+            let fits = any || size.upscale == config.upscale;
             if !(1..=UPSCALE_MAX).contains(&r) || !fits {
                 let expected = if any {
                     format!("an upscale of 1 to {UPSCALE_MAX}")

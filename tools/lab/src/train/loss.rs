@@ -148,7 +148,8 @@ pub fn candidate_index(inverse: &[f32], range: NearFar, candidates: usize) -> Ve
 /// Returns the median of each 4×4 block of `[height, width]` over its known pixels; NaN where fewer
 /// than half are known. Both sides are multiples of 4.
 pub fn block_median(index: &[f32], width: usize) -> Vec<f32> {
-    let (w, h) = (width / 4, index.len() / width.max(1) / 4);
+    let w = width / 4;
+    let h = index.len() / width.max(1) / 4;
     let mut out = Vec::with_capacity(w * h);
     for (y, x) in (0..h).flat_map(|y| (0..w).map(move |x| (y, x))) {
         let rows = (0..4).flat_map(|r| &index[(4 * y + r) * width + 4 * x..][..4]);

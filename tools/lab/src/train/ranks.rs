@@ -235,7 +235,9 @@ impl Exchange {
     ) -> Result<GroupSum> {
         let owner = self.owner(group, groups);
         let path = self.path(group, owner);
-        let (begin, mut pause, mut other) = (Instant::now(), POLL_INTERVALS[0], false);
+        let begin = Instant::now();
+        let mut pause = POLL_INTERVALS[0];
+        let mut other = false;
         loop {
             match std::fs::read(&path) {
                 Ok(bytes) => match self.parse(&path, &bytes, optimizer)? {
@@ -292,7 +294,8 @@ impl Exchange {
         let gradients = Gradients::from_parts(sum, touched, optimizer)
             .ok_or_else(|| bad("those of another number of parameters".to_owned()))?;
         self.ends |= text(END_KEY).as_deref() == Some("true");
-        let (terms, seconds) = (Terms::from_array(values), Seconds::default());
+        let terms = Terms::from_array(values);
+        let seconds = Seconds::default();
         Ok(Some(GroupSum { gradients, terms, seconds }))
     }
 

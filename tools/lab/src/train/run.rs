@@ -303,7 +303,8 @@ impl Training {
                     exchange.publish(number(group), sum, self.end)?;
                 }
             }
-            let (mut sums, mut of_round) = (sums.into_iter(), Terms::default());
+            let mut sums = sums.into_iter();
+            let mut of_round = Terms::default();
             // In the order of the groups: the sums do not depend on their processes.
             for (group, chunk) in examples.chunks(config.together.max(1)).enumerate() {
                 let own = if groups[group].is_empty() { None } else { sums.next() };

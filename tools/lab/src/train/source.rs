@@ -187,7 +187,8 @@ impl<S: Source> Replay<S> {
     pub fn source_index(&self, index: u64) -> u64 {
         let block = index / (self.window * self.times);
         let within = index % (self.window * self.times);
-        let (pass, i) = (within / self.window, within % self.window);
+        let pass = within / self.window;
+        let i = within % self.window;
         block * self.window + shuffled(i, self.window, hash(block, pass))
     }
 }

@@ -200,7 +200,9 @@ impl GroupSum {
 pub fn views_of(examples: &[&Example]) -> Result<Views> {
     let first = examples.iter().flat_map(|e| &e.context).next();
     let Some(first) = first else { return Err(Error::value("examples", "at least one", "none")) };
-    let (w, h, v) = (first.image.width, first.image.height, examples[0].context.len());
+    let w = first.image.width;
+    let h = first.image.height;
+    let v = examples[0].context.len();
     let mut pixels = Vec::with_capacity(examples.len() * v * 3 * w * h);
     for picture in examples.iter().flat_map(|e| &e.context) {
         pixels.extend(picture.image.to_planes());

@@ -80,7 +80,9 @@ pub fn rooms(config: &TrainConfig, split: Split) -> Result<Rooms> {
     };
     let seed = if held_out { hash(data.seed, HELD_OUT) } else { data.seed };
     let scenes = if held_out { 0 } else { data.scenes };
-    let (sizes, seen_range, detail) = (data.sizes.clone(), data.seen_range, data.detail);
+    let sizes = data.sizes.clone();
+    let seen_range = data.seen_range;
+    let detail = data.detail;
     Ok(Rooms { seed, scenes, spec, targets, sizes, seen_range, detail })
 }
 
@@ -318,7 +320,8 @@ fn tiled(rows: &[Vec<Labelled>]) -> Rgb {
     let longest = all().map(|l| l.label.chars().count()).max().unwrap_or(1).max(1);
     // Dots as large as the longest label allows, of at most 1/60 of the picture's height.
     let scale = (w / (lettering::ADVANCE * longest)).min(h / 60).max(1);
-    let (margin, text) = (scale * LABEL_MARGIN, scale * lettering::HEIGHT);
+    let margin = scale * LABEL_MARGIN;
+    let text = scale * lettering::HEIGHT;
     let strip = text + 2 * margin;
     let columns = rows.iter().map(Vec::len).max().unwrap_or(1);
     let mut sheet = Rgb::black(w * columns.max(1), (strip + h) * rows.len().max(1));

@@ -48,7 +48,8 @@ impl Convolve for Direct {
         let blocks_per_part = weights.blocks.len().div_ceil(parts);
         let y = SharedSliceMut::new(y);
         (0..tiles * parts).into_par_iter().for_each(|job| {
-            let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
+            let image = job / parts / starts.len();
+            let start = starts[job / parts % starts.len()];
             let first = (job % parts * blocks_per_part).min(weights.blocks.len());
             let blocks = first..(first + blocks_per_part).min(weights.blocks.len());
             if blocks.is_empty() {

@@ -24,7 +24,8 @@ impl Kernel for NarrowKernel<'_, '_> {
         let layout = job.layout;
         let [depth, height, width] = job.valid_outputs(start);
         let offsets = job.offsets();
-        let (image_width, x_row_stride) = (job.plan.dst_size[2], layout.row_stride());
+        let image_width = job.plan.dst_size[2];
+        let x_row_stride = layout.row_stride();
         let pass = MAX_NARROW_CHANNELS.min(job.row_stride);
         let rows = (MAX_GRADIENT_FLOATS / (pass * width)).clamp(1, height);
         let farthest = offsets.iter().max().copied().unwrap_or(0);

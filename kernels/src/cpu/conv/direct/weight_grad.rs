@@ -101,7 +101,8 @@ impl TiledWeightGrad for DirectWeightGrad {
             // A leftover NaN times zero would be NaN.
             packed[floats..].fill(0.0);
             level.run(PackTile { plan, layout, x, start, out: packed });
-            let (x, scratch) = (&*packed, &mut buffers.scratch);
+            let x = &*packed;
+            let scratch = &mut buffers.scratch;
             let products = TileProducts { job, x, dy, start, scratch, sums: &mut *sums };
             match self.lanes {
                 LaneAxis::OutputChannels => level.run(WideKernel(products)),

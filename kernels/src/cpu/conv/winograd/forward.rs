@@ -79,7 +79,8 @@ impl TransformTask for ImageBlocks<'_> {
         let tile_rows = tile_rows.clamp(1, height.div_ceil(TILE));
         let starts = tile_starts(plan.grid(), [1, tile_rows * TILE, tile_columns * TILE]);
         (0..call.images * starts.len()).into_par_iter().for_each(|job| {
-            let (image, start) = (job / starts.len(), starts[job % starts.len()]);
+            let image = job / starts.len();
+            let start = starts[job % starts.len()];
             Buffers::with(|buffers| {
                 let transform = PhantomData::<T>;
                 level.run::<BlockJob<'_, T, IN, POINTS, OUT>>(BlockJob {

@@ -220,7 +220,8 @@ impl Places<'_> {
         // Spans beyond the last repeat it.
         let span_first = |k: usize| (first + k * span_tiles).min(count - span_tiles);
         let own = T::INPUTS_BEFORE as isize;
-        let (mut starts, mut valid_lanes) = ([0; 8], [[0; 8]; MAX_ROWS]);
+        let mut starts = [0; 8];
+        let mut valid_lanes = [[0; 8]; MAX_ROWS];
         for k in 0..T::INPUT_STEP {
             let Column { start, x, rows } = column(span_first(k), own);
             let valid = (0..LANES).filter(|lane| self.has(x + *lane as isize));
@@ -324,7 +325,9 @@ impl TileLoader<'_> {
         let images = x.chunks(source.image_stride);
         let packed = packed.floats(images.len() * channel_stride + OVERREAD);
         for (x, out) in images.zip(packed.chunks_exact_mut(channel_stride)) {
-            let (plan, layout, start) = (source.reader, &source.layout, source.start);
+            let plan = source.reader;
+            let layout = &source.layout;
+            let start = source.start;
             s.call(PackTile { plan, layout, x: &x[..pixels], start, out });
         }
         for (v, starts) in source.tile_starts.iter().enumerate() {
@@ -375,7 +378,8 @@ impl TileLoader<'_> {
                 [a, b, c, d, v[4], v[5], v[6], v[7]]
             }
         };
-        let (first, last) = (T::INPUTS_BEFORE, T::INPUTS_BEFORE + T::INPUT_STEP);
+        let first = T::INPUTS_BEFORE;
+        let last = T::INPUTS_BEFORE + T::INPUT_STEP;
         let mut row = [s.splat(0.0); IN];
         for j in 0..IN {
             row[j] = match j {

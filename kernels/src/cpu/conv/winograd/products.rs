@@ -140,7 +140,8 @@ fn transform_columns<S, T, const IN: usize, const POINTS: usize, const OUT: usiz
     T: Transform<IN, POINTS, OUT>,
 {
     assert!(products.len() >= layout.floats);
-    let (vectors, products) = (layout.vectors(channel, first), products.as_ptr());
+    let vectors = layout.vectors(channel, first);
+    let products = products.as_ptr();
     for j in 0..POINTS {
         let mut column = [s.splat(0.0); POINTS];
         for i in 0..POINTS {
@@ -195,7 +196,8 @@ impl<'a> OutputWriter<'a> {
         let [slices, height, width] = plan.dst_size;
         let output_tile = |t: usize| {
             let lane = transpose4x4_index(tiles.lane(t) % LANES);
-            let (image, t) = (image + t / per_image, t % per_image);
+            let image = image + t / per_image;
+            let t = t % per_image;
             let row = top * OUT / TILE + t / per_row * OUT;
             let column = left * OUT / TILE + t % per_row * OUT;
             let slice = image * plan.dst_channels * slices + depth;

@@ -149,7 +149,8 @@ impl SumProducts<'_, '_> {
         let [_, tile_rows, per_row] = valid.map(|n| n.div_ceil(TILE));
         let x_pixels = job.plan.src_pixels();
         let dy_image = job.plan.dst_channels * job.plan.dst_pixels();
-        let (per_image, channels) = (tile_rows * per_row, job.rows / TAPS);
+        let per_image = tile_rows * per_row;
+        let channels = job.rows / TAPS;
         let count = dy.len() / dy_image * per_image;
         let block = TileBlock { count, per_row, per_image };
         let (lanes, used_lanes) = (block.lanes(), block.used_lanes());

@@ -82,7 +82,8 @@ impl<S: Simd> TransformTask for WithSimd<S, TransformWeights<'_>> {
         for first in (0..channels).step_by(2) {
             let mut kernels = [s.splat(0.0); LANES];
             for lane in 0..LANES {
-                let (src, m) = (first + lane / BLOCK_CHANNELS, lane % BLOCK_CHANNELS);
+                let src = first + lane / BLOCK_CHANNELS;
+                let m = lane % BLOCK_CHANNELS;
                 if src >= channels || m >= block.channels {
                     continue;
                 }

@@ -284,7 +284,8 @@ fn rgb(bytes: &[u8], row: usize, (width, height): (usize, usize), bgra: bool) ->
     let mut data = Vec::with_capacity(3 * width * height);
     for line in bytes.chunks_exact(row).take(height) {
         for pixel in line.chunks_exact(4).take(width) {
-            let (first, rest) = (pixel.iter().take(3), pixel.iter().take(3).rev());
+            let first = pixel.iter().take(3);
+            let rest = pixel.iter().take(3).rev();
             if bgra { data.extend(rest) } else { data.extend(first) }
         }
     }

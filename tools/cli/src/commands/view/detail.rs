@@ -170,7 +170,8 @@ mod tests {
     }
 
     fn camera(distance: f32) -> Camera {
-        let (f, c) = (SIDE as f32, 0.5 * SIDE as f32);
+        let f = SIDE as f32;
+        let c = 0.5 * SIDE as f32;
         let k = Intrinsics { fx: f, fy: f, cx: c, cy: c, width: SIDE, height: SIDE };
         Camera::new(k, Mat4::from_translation(Vec3::Z * (1.0 - distance))).unwrap()
     }
@@ -181,7 +182,9 @@ mod tests {
             assert!(std::env::var("SUBSPLAT_GPU").as_deref() != Ok("require"), "no GPU");
             return;
         };
-        let (splats, far, near) = (wall(), camera(8.0), camera(0.5));
+        let splats = wall();
+        let far = camera(8.0);
+        let near = camera(0.5);
         let mut detail = Detail::new(splats.clone());
         // The first task makes the levels; no second one begins before it is finished.
         assert!(detail.scene(&far, Fit::Exact).is_none());

@@ -85,7 +85,9 @@ fn plan(args: &ViewArgs) -> Result<Plan> {
         // `ViewArgs::conflict` reports it first.
         bail!("--device: expected auto, gpu or an adapter's name, got cpu");
     }
-    let (frames, save, out) = (args.frames, args.save.clone(), args.out.clone());
+    let frames = args.frames;
+    let save = args.save.clone();
+    let out = args.out.clone();
     let levels = args.levels == LevelsArg::Auto;
     Ok(Plan { size, device, frames, save, out, levels })
 }

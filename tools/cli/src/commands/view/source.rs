@@ -241,7 +241,8 @@ impl Unrefined {
     }
 
     fn refine(mut self, refine: Refine, show: &mut dyn FnMut(Made) -> Result<()>) -> Result<()> {
-        let (options, upscale) = (self.options, Some(self.upscale));
+        let options = self.options;
+        let upscale = Some(self.upscale);
         let (mut shown, mut failure) = (Instant::now(), None);
         let mut progress = |refiner: &Refiner<'_>| {
             if shown.elapsed() >= SHOWN_EVERY {

@@ -303,7 +303,9 @@ impl Viewer {
         let Some(ready) = self.ready.get_mut(&self.current) else { return };
         let camera = self.navigator.camera();
         let Some(task) = ready.detail.missing(&camera, Fit::Fine) else { return };
-        let (number, gpu, proxy) = (ready.number, canvas.gpu().clone(), self.proxy.clone());
+        let number = ready.number;
+        let gpu = canvas.gpu().clone();
+        let proxy = self.proxy.clone();
         // A closed event loop needs no message.
         let work = move || drop(proxy.send_event(Message::Detail(number, task.run(&gpu))));
         if let Err(e) = std::thread::Builder::new().name("levels".to_owned()).spawn(work) {
@@ -417,7 +419,9 @@ impl Viewer {
         else {
             return;
         };
-        let (r, gpu, proxy) = (self.requested, canvas.gpu().clone(), self.proxy.clone());
+        let r = self.requested;
+        let gpu = canvas.gpu().clone();
+        let proxy = self.proxy.clone();
         self.busy = Some((r, "beginning"));
         // A closed event loop needs no message.
         let work = move || {

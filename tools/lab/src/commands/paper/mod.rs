@@ -134,7 +134,9 @@ impl<'a> Maker<'a> {
 
     /// Evaluates all settings, writes the files, and prints the table.
     fn table(&mut self, progress: &mut Progress, answer: Answer) -> Result<Value> {
-        let (mut parts, mut sheets, mut generated) = (Vec::new(), 0, false);
+        let mut parts = Vec::new();
+        let mut sheets = 0;
+        let mut generated = false;
         for setting in self.table.settings {
             let opened = self.open(setting, progress)?;
             generated |= opened.generated;

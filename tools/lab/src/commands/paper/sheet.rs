@@ -110,7 +110,8 @@ fn outline(picture: &mut Rgb, left: usize, top: usize, side: usize) {
 pub fn paste(sheet: &mut Rgb, part: &Rgb, (left, top): (usize, usize)) {
     let width = part.width.min(sheet.width.saturating_sub(left));
     for y in 0..part.height.min(sheet.height.saturating_sub(top)) {
-        let (from, to) = (3 * y * part.width, 3 * ((top + y) * sheet.width + left));
+        let from = 3 * y * part.width;
+        let to = 3 * ((top + y) * sheet.width + left);
         sheet.data[to..to + 3 * width].copy_from_slice(&part.data[from..from + 3 * width]);
     }
 }

@@ -60,7 +60,8 @@ impl Maker<'_> {
         };
         let path = self.out.join("video.webp");
         let mut video: Option<Video> = None;
-        let (mut table, mut stills) = ("frame,x,y,z,still\n".to_owned(), 0);
+        let mut table = "frame,x,y,z,still\n".to_owned();
+        let mut stills = 0;
         progress.steps(&format!("{id} views"), frames, |bar| {
             for (i, camera) in cameras.iter().enumerate() {
                 let view = beside(&scenes, camera);

@@ -188,7 +188,8 @@ impl Layout {
         for _ in 0..12 {
             let w = self.rng.count(0, 3);
             let reach = 0.5 * self.walls()[w].length - half.x - 0.05;
-            let (low, high) = (up[0].max(half.y), up[1].min(self.size.y - half.y - 0.05));
+            let low = up[0].max(half.y);
+            let high = up[1].min(self.size.y - half.y - 0.05);
             if reach <= 0.0 || low > high {
                 continue;
             }
@@ -310,12 +311,14 @@ impl Layout {
     /// Adds an emissive globe on a cord at the lamp's position, in half of the rooms.
     pub(super) fn add_lamp(&mut self, position: Vec3) {
         let mut rng = self.rng.fork(3);
-        let (shown, radius) = (rng.chance(0.5), rng.range(0.07, 0.13));
+        let shown = rng.chance(0.5);
+        let radius = rng.range(0.07, 0.13);
         if !shown || self.primitives.iter().any(|p| p.distance(position) < radius) {
             return;
         }
         let globe = Material::new(Role::Ceiling, &self.palette, &mut rng).into_emissive(4.0);
-        let (globe, cord) = (self.add_material(globe), self.material(Role::Furniture));
+        let globe = self.add_material(globe);
+        let cord = self.material(Role::Furniture);
         let half = Vec3::new(0.006, 0.5 * (self.size.y + position.y), 0.006);
         let middle = position - Vec3::Y * half.y;
         self.add(Form::Ellipsoid, position, Mat3::IDENTITY, Vec3::splat(radius), globe);
@@ -330,7 +333,8 @@ impl Layout {
         let half = Vec2::new(self.rng.range(0.15, 0.5), self.rng.range(0.15, 0.5));
         let Some((wall, at)) = self.free_spot(half, [0.8, 1.8]) else { return };
         let (back, board) = (self.material(Role::Furniture), self.material(Role::Furniture));
-        let (depth, thick) = (self.rng.range(0.05, 0.14), 0.012);
+        let depth = self.rng.range(0.05, 0.14);
+        let thick = 0.012;
         self.mount(wall, at, half.extend(0.004), 0.0, back);
         if self.accepts_extras() {
             for side in [-1.0, 1.0] {

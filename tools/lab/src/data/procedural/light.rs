@@ -106,7 +106,8 @@ impl Room {
         if material.emission > 0.0 {
             return (colour * material.emission, None);
         }
-        let (mut light, mut highlight) = (self.ambient(point, &surface), Vec3::ZERO);
+        let mut light = self.ambient(point, &surface);
+        let mut highlight = Vec3::ZERO;
         for lamp in &self.lighting.lamps {
             let path = lamp.position - point;
             let distance2 = path.length_squared();

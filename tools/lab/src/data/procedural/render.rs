@@ -214,7 +214,8 @@ impl Room {
         rgb: &mut [f32],
         depth: &mut [f32],
     ) {
-        let (right, rows) = ((left + TILE).min(width), depth.len() / width);
+        let right = (left + TILE).min(width);
+        let rows = depth.len() / width;
         let low = Vec2::new(left as f32, top as f32);
         let high = Vec2::new(right as f32, (top + rows) as f32);
         let list = rays.candidates(&self.primitives, low, high);

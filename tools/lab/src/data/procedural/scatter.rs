@@ -147,7 +147,8 @@ impl ObjectBuilder<'_> {
             let material = self.sized_material(Role::Object, size);
             let shape = [(); 3].map(|()| self.rng.log_range(0.12, 1.0));
             let form = [Form::Block, Form::Cylinder, Form::Ellipsoid][self.rng.count(0, 2)];
-            let (axes, offset) = (self.axes(), self.displacement(0.8 * size));
+            let axes = self.axes();
+            let offset = self.displacement(0.8 * size);
             self.add(form, at + offset, axes, size * Vec3::from(shape), material);
         }
     }
@@ -208,7 +209,8 @@ impl ObjectBuilder<'_> {
         let thick = size * self.rng.log_range(0.015, 0.1);
         for along in 0..3 {
             for (u, v) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
-                let (mut place, mut edge) = (half, Vec3::splat(thick));
+                let mut place = half;
+                let mut edge = Vec3::splat(thick);
                 (place[along], edge[along]) = (0.0, half[along] + thick);
                 place[(along + 1) % 3] *= u;
                 place[(along + 2) % 3] *= v;
@@ -223,7 +225,8 @@ impl ObjectBuilder<'_> {
             let material = self.sized_material(Role::Picture, size);
             let half =
                 Vec3::new(self.rng.log_range(0.3, 1.5), self.rng.log_range(0.3, 1.5), 0.004) * size;
-            let (axes, offset) = (self.axes(), self.displacement(0.6 * size));
+            let axes = self.axes();
+            let offset = self.displacement(0.6 * size);
             self.add(Form::Block, at + offset, axes, half, material);
         }
     }

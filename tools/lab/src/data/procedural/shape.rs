@@ -234,7 +234,8 @@ fn slabs(o: Vec3, d: Vec3, half: Vec3) -> (f32, f32) {
 
 /// Returns the first parameter on the unit sphere.
 fn ellipsoid(o: Vec3, d: Vec3) -> Option<f32> {
-    let (a, b) = (d.length_squared(), o.dot(d));
+    let a = d.length_squared();
+    let b = o.dot(d);
     // |o|² − b²/a is the squared distance of line and centre. It has less cancellation than b² − a·c for a small, distant sphere.
     let nearest = o - d * (b / a);
     let inside = 1.0 - nearest.length_squared();
@@ -258,7 +259,8 @@ fn cylinder(o: Vec3, d: Vec3) -> Option<f32> {
         return None;
     }
     let inverse = 1.0 / d.y;
-    let (c, e) = ((-1.0 - o.y) * inverse, (1.0 - o.y) * inverse);
+    let c = (-1.0 - o.y) * inverse;
+    let e = (1.0 - o.y) * inverse;
     enter = enter.max(c.min(e));
     leave = leave.min(c.max(e));
     (enter <= leave).then_some(enter)

@@ -96,7 +96,8 @@ fn standardised(field: &mut [f32]) {
 fn doubled(row: &[f32], out: &mut Vec<f32>) {
     let n = row.len();
     for i in 0..n {
-        let (before, after) = (row[(i + n - 1) % n], row[(i + 1) % n]);
+        let before = row[(i + n - 1) % n];
+        let after = row[(i + 1) % n];
         out.push(0.75 * row[i] + 0.25 * before);
         out.push(0.75 * row[i] + 0.25 * after);
     }
@@ -122,7 +123,8 @@ fn doubled_rows(field: &[f32], width: usize) -> Vec<f32> {
 /// the next coarser octave, because an octave of twice the frequency has four times the area for
 /// its power. The field is `stretch` octaves longer along x than along y.
 pub(super) fn scale_free(size: usize, exponent: f32, stretch: usize, rng: &mut Rng) -> Vec<f32> {
-    let (mut width, mut height) = (2, (2 << stretch).min(size));
+    let mut width = 2;
+    let mut height = (2 << stretch).min(size);
     let mut field: Vec<f32> = (0..width * height).map(|_| rng.normal()).collect();
     let mut amplitude = 1.0;
     while width < size || height < size {
@@ -170,18 +172,21 @@ fn leaves(size: usize, rng: &mut Rng) -> Fields {
     let grain = scale_free(size, 1.1, 0, rng);
     let grain_amplitude = rng.range(0.0, 0.08);
     let boxes = rng.unit();
-    let (low, high) = (rng.log_range(1.5, 5.0), size as f32 * rng.range(0.08, 0.25));
+    let low = rng.log_range(1.5, 5.0);
+    let high = size as f32 * rng.range(0.08, 0.25);
     // Shapes of three times the total area leave 5 % of the background uncovered.
     let mut area = 3.0 * (size * size) as f32;
     while area > 0.0 {
         let r = leaf_radius(low, high, rng);
         let half = [r, r * rng.range(0.35, 1.0)];
         let (sin, cos) = rng.range(0.0, std::f32::consts::PI).sin_cos();
-        let (value, slope) = ([rng.unit(), rng.unit()], 0.12 * rng.normal() / r);
+        let value = [rng.unit(), rng.unit()];
+        let slope = 0.12 * rng.normal() / r;
         let rectangle = rng.chance(boxes);
         let centre = [rng.unit() * size as f32, rng.unit() * size as f32];
         fields.stamp(centre, r * if rectangle { 1.5 } else { 1.1 } + 1.0, |dx, dy| {
-            let (x, y) = (cos * dx + sin * dy, cos * dy - sin * dx);
+            let x = cos * dx + sin * dy;
+            let y = cos * dy - sin * dx;
             let distance = if rectangle {
                 (x.abs() - half[0]).max(y.abs() - half[1])
             } else {
@@ -284,7 +289,9 @@ fn tiles(size: usize, rng: &mut Rng) -> Fields {
     let (width, height) = (size as f32 / columns as f32, size as f32 / rows as f32);
     let grout = rng.log_range(0.02, 0.08) * height;
     let (grain, coarse) = (scale_free(size, 1.1, 0, rng), scale_free(size, 1.5, 0, rng));
-    let (amount, spread, joint) = (rng.range(0.01, 0.12), rng.range(0.02, 0.3), rng.unit());
+    let amount = rng.range(0.01, 0.12);
+    let spread = rng.range(0.02, 0.3);
+    let joint = rng.unit();
     let values: Vec<[f32; 2]> = (0..rows * columns).map(|_| [rng.normal(), rng.normal()]).collect();
     Fields::from_fn(size, |x, y| {
         let row = y * rows / size;
@@ -305,8 +312,8 @@ fn tiles(size: usize, rng: &mut Rng) -> Fields {
 /// Synthesises wooden boards.
 fn planks(size: usize, rng: &mut Rng) -> Fields {
     let rows = [1, 2, 4, 8][rng.count(0, 3)];
-    let (fine, rings) =
-        (scale_free(size, rng.range(0.8, 1.2), 5, rng), scale_free(size, 1.6, 3, rng));
+    let fine = scale_free(size, rng.range(0.8, 1.2), 5, rng);
+    let rings = scale_free(size, 1.6, 3, rng);
     let (amount, frequency) = (rng.range(0.06, 0.14), rng.range(1.0, 4.0));
     let boards: Vec<[f32; 3]> =
         (0..rows).map(|_| [rng.normal(), rng.normal(), rng.unit()]).collect();
@@ -342,7 +349,9 @@ fn weave(size: usize, rng: &mut Rng) -> Fields {
 fn blobs(size: usize, rng: &mut Rng) -> Fields {
     let exponent = rng.range(1.0, 1.8);
     let (noise, other) = (scale_free(size, exponent, 0, rng), scale_free(size, exponent, 0, rng));
-    let (t0, t1, softness) = (0.5 * rng.normal(), 0.7 * rng.normal(), rng.log_range(0.03, 0.3));
+    let t0 = 0.5 * rng.normal();
+    let t1 = 0.7 * rng.normal();
+    let softness = rng.log_range(0.03, 0.3);
     let step = |v: f32| {
         let t = (v / softness + 0.5).clamp(0.0, 1.0);
         t * t * (3.0 - 2.0 * t)

@@ -112,8 +112,10 @@ impl Texture {
         // The mask wraps negative positions correctly in two's complement, because the side is a
         // power of two.
         let (x0, y0) = (x0 as i64 as usize, y0 as i64 as usize);
-        let (left, right) = (x0 & mask, x0.wrapping_add(1) & mask);
-        let (top, bottom) = ((y0 & mask) * side, (y0.wrapping_add(1) & mask) * side);
+        let left = x0 & mask;
+        let right = x0.wrapping_add(1) & mask;
+        let top = (y0 & mask) * side;
+        let bottom = (y0.wrapping_add(1) & mask) * side;
         let t = &self.levels[level];
         let [a, b, c, d] = [t[top + left], t[top + right], t[bottom + left], t[bottom + right]];
         let blend = |k: usize| {

@@ -81,7 +81,8 @@ impl Learner {
     fn picture_loss(&self, rgb: &Tensor, target: &Posed) -> Result<(Tensor, Terms)> {
         let w = &self.config.loss;
         let (_, height, width) = rgb.dims3()?;
-        let (x, truth) = (flat(rgb)?, target.image.to_planes());
+        let x = flat(rgb)?;
+        let truth = target.image.to_planes();
         let mut all = loss::mse(&x, &truth).scaled(w.mse);
         let mut terms = Terms {
             mse: all.value / w.mse.max(1e-30),
