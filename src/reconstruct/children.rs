@@ -45,10 +45,12 @@ enum Origins {
 /// 1 alone where the children are the primaries.
 fn grids_of(network: &SubSplat) -> Vec<usize> {
     let config = network.config();
-    match config.spgr.head.serves_any_k() {
-        _ if network.trunk().is_off() || config.upscale == 1 => vec![1],
-        true => grids(config.upscale),
-        false => vec![1, config.upscale],
+    if network.trunk().is_off() || config.upscale == 1 {
+        vec![1]
+    } else if config.spgr.head.serves_any_k() {
+        grids(config.upscale)
+    } else {
+        vec![1, config.upscale]
     }
 }
 

@@ -54,19 +54,19 @@ fn is_large(layout: &Layout) -> bool {
 // that.
 unsafe impl GlobalAlloc for Pages {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        match is_large(&layout) {
-            true => large::allocate(layout.size()).0,
-            // SAFETY: the caller's.
-            false => unsafe { System.alloc(layout) },
+        if is_large(&layout) {
+            return large::allocate(layout.size()).0;
         }
+        // SAFETY: the caller's.
+        unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-        match is_large(&layout) {
-            true => large::free(at, layout.size()),
-            // SAFETY: the caller's; small blocks came from there.
-            false => unsafe { System.dealloc(at, layout) },
+        if is_large(&layout) {
+            return large::free(at, layout.size());
         }
+        // SAFETY: the caller's; small blocks came from there.
+        unsafe { System.dealloc(at, layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
@@ -85,19 +85,18 @@ unsafe impl GlobalAlloc for Pages {
     unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         // SAFETY: the caller's: `size` fits a layout of this alignment.
         let wanted = unsafe { Layout::from_size_align_unchecked(size, layout.align()) };
-        match is_large(&layout) || is_large(&wanted) {
+        if !is_large(&layout) && !is_large(&wanted) {
             // SAFETY: the caller's; both are small.
-            false => unsafe { System.realloc(at, layout, size) },
-            // SAFETY: the new block holds the lesser of both sizes, and the old one
-            // came from here.
-            true => unsafe {
-                let to = self.alloc(wanted);
-                if !to.is_null() {
-                    to.copy_from_nonoverlapping(at, layout.size().min(size));
-                    self.dealloc(at, layout);
-                }
-                to
-            },
+            return unsafe { System.realloc(at, layout, size) };
+        }
+        // SAFETY: the new block holds the lesser of both sizes, and the old one came from here.
+        unsafe {
+            let to = self.alloc(wanted);
+            if !to.is_null() {
+                to.copy_from_nonoverlapping(at, layout.size().min(size));
+                self.dealloc(at, layout);
+            }
+            to
         }
     }
 }

@@ -301,11 +301,11 @@ fn sizes(scores: &Scores) -> String {
 
 /// A ratio as JSON: a whole number where it is one.
 fn json_ratio(ratio: f32) -> Value {
-    match ratio.fract() == 0.0 {
-        true => json!(ratio as usize),
-        // The shortest digits of the f32, not those of its value as f64.
-        false => ratio.to_string().parse::<f64>().map_or(Value::Null, |r| json!(r)),
+    if ratio.fract() == 0.0 {
+        return json!(ratio as usize);
     }
+    // The shortest digits of the f32, not those of its value as f64.
+    ratio.to_string().parse::<f64>().map_or(Value::Null, |r| json!(r))
 }
 
 fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -> Value {

@@ -152,12 +152,12 @@ impl Source for Rooms {
         let depths = made.views.iter().take(inverse_depth.len()).flat_map(|v| &v.depth);
         let near_far = self.visible_range(hash(made.seed, 0x5EE), depths.copied());
         let near_far = near_far.unwrap_or(NearFar::new(made.near, made.far));
-        let input_targets = match self.targets.inputs {
-            false => InputTargets::Absent,
-            true if uniform(hash(made.seed, 0xDE_7A), 0) < f64::from(self.detail) => {
-                InputTargets::WithDetail
-            }
-            true => InputTargets::Plain,
+        let input_targets = if !self.targets.inputs {
+            InputTargets::Absent
+        } else if uniform(hash(made.seed, 0xDE_7A), 0) < f64::from(self.detail) {
+            InputTargets::WithDetail
+        } else {
+            InputTargets::Plain
         };
         let context = pictures;
         Ok(Arc::new(Example { context, targets, inverse_depth, near_far, input_targets }))

@@ -321,13 +321,13 @@ impl<'a> Maker<'a> {
         let given = self.args.pred.iter().find(|m| slug(m.name()) == slug(row))?;
         let Method::Other { name, folder } = given else { return None };
         let own = folder.join(setting.slug());
-        let folder = match own.is_dir() {
-            true => own,
+        let folder = if own.is_dir() {
+            own
+        } else if self.table.settings.iter().any(|s| folder.join(s.slug()).is_dir()) {
             // A folder of other settings has nothing for this one.
-            false if self.table.settings.iter().any(|s| folder.join(s.slug()).is_dir()) => {
-                return None;
-            }
-            false => folder.clone(),
+            return None;
+        } else {
+            folder.clone()
         };
         Some(Method::Other { name: name.clone(), folder })
     }

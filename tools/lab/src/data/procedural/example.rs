@@ -166,14 +166,15 @@ impl Example {
         let mut context_grades = Vec::with_capacity(CONTEXT);
         let render = |(i, camera): (usize, &Camera)| {
             let target = i >= CONTEXT;
-            let grade = match spec.photographic {
-                true if i >= first_input_target => {
-                    let grade: Grade = context_grades[i - first_input_target];
-                    Grade { softness: 0.0, noise: 0.0, ..grade }
-                }
-                true if target && targets.clean => scene,
-                true => scene.sample_view(soft, rng),
-                false => Grade::default(),
+            let grade = if !spec.photographic {
+                Grade::default()
+            } else if i >= first_input_target {
+                let grade: Grade = context_grades[i - first_input_target];
+                Grade { softness: 0.0, noise: 0.0, ..grade }
+            } else if target && targets.clean {
+                scene
+            } else {
+                scene.sample_view(soft, rng)
             };
             if !target {
                 context_grades.push(grade);
