@@ -15,11 +15,9 @@
 use super::primaries::primaries;
 use super::subsplat::{SceneOutput, SubSplat, in_pool};
 use super::trace::{Checkpoint, Trace};
-#[cfg(feature = "gpu")]
 use super::trunk::DeviceParents;
 use super::trunk::{MixedChildren, Trunk};
 use super::{BackboneOutput, Primaries, Views};
-#[cfg(feature = "gpu")]
 use crate::network::ops::{Array, TapeArray};
 use crate::scene::splats::Splats;
 use candle_core::{Result, Tensor, bail};
@@ -40,13 +38,11 @@ pub struct SceneEncoding {
 
 enum Output {
     Host(BackboneOutput),
-    #[cfg(feature = "gpu")]
     Device(BackboneOutput<TapeArray>),
 }
 
 enum Place {
     Host(BackboneOutput, Primaries),
-    #[cfg(feature = "gpu")]
     Device(Box<DeviceParents>),
 }
 
@@ -71,7 +67,6 @@ impl SubSplat {
         if views.scenes() != 1 {
             bail!("encoding: expected one scene, got {}", views.scenes());
         }
-        #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk().on_device(|executor| {
             let images = executor.upload(&views.images)?;
             let output = self.encode_on(views, &images, &mut Trace::with_checkpoint(checkpoint))?;
@@ -104,7 +99,6 @@ impl SubSplat {
     pub fn place(&self, features: SceneFeatures) -> Result<SceneEncoding> {
         let SceneFeatures { views, output } = features;
         let settings = self.config().primaries();
-        #[cfg(feature = "gpu")]
         let output = match output {
             Output::Host(output) => output,
             Output::Device(output) => {
@@ -120,14 +114,11 @@ impl SubSplat {
                 };
             }
         };
-        #[cfg(not(feature = "gpu"))]
-        let Output::Host(output) = output;
         let parents = primaries(&output, &views, settings, &mut Trace::off())?;
         Ok(SceneEncoding::new(views, output, parents))
     }
 
     /// Computes backbone and primaries on the CPU, after a failure of the device.
-    #[cfg(feature = "gpu")]
     fn encoding_on_host(&self, views: &Views) -> Result<SceneEncoding> {
         self.place(in_pool(|| self.host_features(views, &|| Ok(())))?)
     }
@@ -143,7 +134,6 @@ impl SceneEncoding {
     pub fn per_view(&self) -> usize {
         match &self.place {
             Place::Host(_, primaries) => primaries.per_view,
-            #[cfg(feature = "gpu")]
             Place::Device(parents) => parents.per_view,
         }
     }
@@ -162,7 +152,6 @@ impl SceneEncoding {
             Place::Host(_, primaries) => {
                 network.trunk().parents(&self.views, primaries)?.to_splats()
             }
-            #[cfg(feature = "gpu")]
             Place::Device(parents) => {
                 match network.trunk().on_device(|executor| parents.to_host(executor)) {
                     Some(parents) => parents,
@@ -180,7 +169,6 @@ impl SceneEncoding {
     pub fn children(&self, network: &SubSplat, checkpoint: Checkpoint<'_>) -> Result<SceneOutput> {
         let (output, primaries) = match &self.place {
             Place::Host(output, primaries) => (output, primaries),
-            #[cfg(feature = "gpu")]
             Place::Device(parents) => {
                 let made = network.trunk().on_device(|executor| {
                     let trunk = network.trunk();
@@ -223,7 +211,6 @@ impl SceneEncoding {
         let trunk = network.trunk();
         let (output, primaries) = match &self.place {
             Place::Host(output, primaries) => (output, primaries),
-            #[cfg(feature = "gpu")]
             Place::Device(device) => {
                 let made = trunk.on_device(|executor| {
                     let own = (&**device, parents);
@@ -260,7 +247,6 @@ impl SceneEncoding {
             Place::Host(output, primaries) => {
                 in_pool(|| trunk.render(&self.views, output, primaries, camera, options))
             }
-            #[cfg(feature = "gpu")]
             Place::Device(parents) => {
                 let made = trunk.on_device(|executor| {
                     let steps: (Checkpoint<'_>, bool) = (&|| Ok(()), false);

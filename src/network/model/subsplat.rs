@@ -4,7 +4,6 @@ use super::backbone::small::{DepthMaps, DisparityMean};
 use super::backbone::{Mvsplat, SmallBackbone};
 use super::half_size_pass;
 use super::primaries::primaries;
-#[cfg(feature = "gpu")]
 use super::taped::Tape;
 use super::taped::Taped;
 use super::trace::{Checkpoint, Trace};
@@ -110,7 +109,6 @@ impl SubSplat {
     /// Those of [`SubSplat::encode`] and of `checkpoint`.
     pub fn encode_with(&self, views: &Views, checkpoint: Checkpoint<'_>) -> Result<BackboneOutput> {
         self.check_input(views)?;
-        #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
             let mut trace = Trace::with_checkpoint(checkpoint);
@@ -197,7 +195,6 @@ impl SubSplat {
         trace: &Trace<'_>,
     ) -> Result<Tensor> {
         let mean = DisparityMean::AroundMode;
-        #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
             network.depth_on(views, &images, mean, trace)?.index.to_host()
@@ -217,7 +214,6 @@ impl SubSplat {
         views: &Views,
         mean: DisparityMean,
     ) -> Result<Taped<(BackboneOutput, Option<DepthMaps>)>> {
-        #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
             let (mut output, maps) = self.train_on(views, &images, mean)?;
@@ -260,7 +256,6 @@ impl SubSplat {
         let Encoder::Small(encoder) = &self.encoder else {
             bail!("depth maps: expected the small backbone, got MVSplat's")
         };
-        #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
             let maps = encoder.depth_on(views, &images, mean, &Trace::off())?;

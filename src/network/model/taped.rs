@@ -3,29 +3,22 @@
 //! On a GPU the results are copies in host memory, and leaves of candle's graph. candle's backward
 //! pass ends at them; [`Taped::backward`] continues it on the device.
 
-#[cfg(feature = "gpu")]
 use super::BackboneOutput;
-#[cfg(feature = "gpu")]
 use super::backbone::small::DepthMaps;
-#[cfg(feature = "gpu")]
 use crate::network::ops::{Array, Executor, TapeArray};
-#[cfg(feature = "gpu")]
 use candle_core::Var;
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor};
-#[cfg(feature = "gpu")]
 use std::sync::Arc;
 
 /// Tensors of a forward pass, and its tape where a GPU computed them.
 pub struct Taped<T> {
     /// The tensors.
     pub value: T,
-    #[cfg(feature = "gpu")]
     tape: Option<Tape>,
 }
 
 /// Copies of results in host memory, and the results.
-#[cfg(feature = "gpu")]
 pub(super) struct Tape {
     executor: Arc<Executor>,
     results: Vec<(Var, TapeArray)>,
@@ -34,26 +27,17 @@ pub(super) struct Tape {
 impl<T> Taped<T> {
     /// Returns tensors whose graph is candle's.
     pub(super) fn on_host(value: T) -> Self {
-        Self {
-            value,
-            #[cfg(feature = "gpu")]
-            tape: None,
-        }
+        Self { value, tape: None }
     }
 
     /// Returns the tensors of [`Tape::copy`].
-    #[cfg(feature = "gpu")]
     pub(super) fn on_device(value: T, tape: Tape) -> Self {
         Self { value, tape: Some(tape) }
     }
 
     /// Replaces the tensors, with which the tape stays.
     pub fn map<U>(self, f: impl FnOnce(T) -> U) -> Taped<U> {
-        Taped {
-            value: f(self.value),
-            #[cfg(feature = "gpu")]
-            tape: self.tape,
-        }
+        Taped { value: f(self.value), tape: self.tape }
     }
 
     /// Continues the backward pass whose gradients are in `store`. Returns scalars, to whose sum
@@ -63,16 +47,13 @@ impl<T> Taped<T> {
     /// # Errors
     /// Errors of the device.
     pub fn backward(self, store: &GradStore) -> Result<Vec<Tensor>> {
-        #[cfg(feature = "gpu")]
         if let Some(tape) = self.tape {
             return tape.backward(store);
         }
-        let _ = store;
         Ok(Vec::new())
     }
 }
 
-#[cfg(feature = "gpu")]
 impl Tape {
     pub(super) fn new(executor: &Arc<Executor>) -> Self {
         Self { executor: executor.clone(), results: Vec::new() }
@@ -100,7 +81,6 @@ impl Tape {
     }
 }
 
-#[cfg(feature = "gpu")]
 impl BackboneOutput<TapeArray> {
     /// Returns copies in host memory that `tape` knows.
     pub(super) fn copied(&self, tape: &mut Tape) -> Result<BackboneOutput> {
@@ -114,7 +94,6 @@ impl BackboneOutput<TapeArray> {
     }
 }
 
-#[cfg(feature = "gpu")]
 impl DepthMaps<TapeArray> {
     /// Returns copies in host memory that `tape` knows.
     pub(super) fn copied(&self, tape: &mut Tape) -> Result<DepthMaps> {

@@ -6,14 +6,12 @@
 
 mod initial_values;
 mod mixed_counts;
-#[cfg(feature = "gpu")]
 mod on_device;
 mod recompute;
 mod scene_gaussians;
 
 pub use initial_values::{initial_value, set_initial_values};
 pub use mixed_counts::MixedChildren;
-#[cfg(feature = "gpu")]
 pub(super) use on_device::DeviceParents;
 pub use recompute::Recomputed;
 pub use scene_gaussians::Children;
@@ -26,7 +24,6 @@ use super::spgr_heads::{Heads, rules};
 use super::trace::Checkpoint;
 use super::{BackboneOutput, Primaries, Views};
 use crate::network::config::{Config, FeatureLevel, ShInput, SpgrHead};
-#[cfg(feature = "gpu")]
 use crate::network::ops::Executor;
 use crate::network::ops::direct_rendering::{Footprint, rasterize_footprints, spgr_footprints};
 use crate::network::ops::spgr::{Rules, Spgr, spgr_on};
@@ -34,7 +31,6 @@ use crate::network::ops::{Array, Backend, rasterize_on};
 use candle_core::{DType, Device, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 use rayon::prelude::*;
-#[cfg(feature = "gpu")]
 use std::sync::Arc;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{
@@ -79,7 +75,6 @@ pub struct Trunk {
     parts: Option<Parts>,
     backend: Backend,
     /// The GPU of `backend`, if it is one.
-    #[cfg(feature = "gpu")]
     executor: Option<Arc<Executor>>,
 }
 
@@ -175,21 +170,13 @@ impl Trunk {
             None
         };
         let rules = rules(config, config.children());
-        Ok(Self {
-            config: config.clone(),
-            rules,
-            parts,
-            backend: Backend::Cpu,
-            #[cfg(feature = "gpu")]
-            executor: None,
-        })
+        Ok(Self { config: config.clone(), rules, parts, backend: Backend::Cpu, executor: None })
     }
 
     /// Sets the backend of the following calls: of all operations, in training only where
     /// [`Trunk::trains_on_device`], else of gathers and SPGR.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.backend = backend.clone();
-        #[cfg(feature = "gpu")]
         {
             self.executor = Executor::new(backend);
         }
@@ -210,7 +197,6 @@ impl Trunk {
     }
 
     /// Returns whether the trunk reads the backbone's feature map of `level`.
-    #[cfg(feature = "gpu")]
     pub(super) fn reads(&self, level: FeatureLevel) -> bool {
         // Mixed numbers of children need the parts even where r is 1.
         let aggregation = self.parts.as_ref().and_then(|parts| parts.aggregation.as_ref());
@@ -291,7 +277,6 @@ impl Trunk {
         let Some(parts) = self.parts() else { return self.parents(views, primaries) };
         let how = Chunking { size: self.chunk_size(), mode: Mode::Infer, checkpoint };
         let sh = || -> Result<_> { Ok((interleaved(&primaries.sh)?, primaries.sh_basis)) };
-        #[cfg(feature = "gpu")]
         if let Some(result) = self.on_device(|executor| {
             let like = |t: &Tensor| executor.upload(t);
             let scene = self.scene_on(parts, views, backbone, primaries, like)?;
@@ -306,13 +291,11 @@ impl Trunk {
     }
 
     /// Returns the GPU of the trunk's backend, if it is one.
-    #[cfg(feature = "gpu")]
     pub fn executor(&self) -> Option<&Arc<Executor>> {
         self.executor.as_ref()
     }
 
     /// Runs `f` on the GPU; `None` where there is none or it failed, and the CPU takes over.
-    #[cfg(feature = "gpu")]
     pub(super) fn on_device<R>(
         &self,
         f: impl FnOnce(&Arc<Executor>) -> Result<R>,

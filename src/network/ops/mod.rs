@@ -17,8 +17,12 @@ pub mod channels_last;
 mod conv;
 pub mod conv2d;
 pub mod conv3d;
+mod device;
 pub mod direct_rendering;
 #[cfg(feature = "gpu")]
+pub mod executor;
+#[cfg(not(feature = "gpu"))]
+#[path = "executor_absent.rs"]
 pub mod executor;
 pub mod feed_forward;
 pub mod linear;
@@ -35,11 +39,8 @@ mod splat_tensors;
 
 pub use array::{Array, ConvConfig};
 pub use backend::{Backend, NoDevice};
-#[cfg(feature = "gpu")]
-pub use executor::{
-    ColourLayout, DeviceAdam, DeviceGradients, DeviceSplats, Executor, ParameterStep, SharedStep,
-    TapeArray,
-};
+pub use device::{ColourLayout, DeviceSplats, ParameterStep, SharedStep};
+pub use executor::{DeviceAdam, DeviceGradients, Executor, TapeArray};
 #[cfg(feature = "gpu")]
 pub(crate) use rasterize::check_options as check_raster_options;
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};

@@ -21,7 +21,6 @@ use subsplat::network::model::trace::Trace;
 use subsplat::network::model::weights::{Weights, read_tensors};
 use subsplat::network::model::{BackboneOutput, Primaries, Views};
 use subsplat::network::ops::Backend;
-#[cfg(feature = "gpu")]
 use subsplat::network::ops::Executor;
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 
@@ -128,12 +127,9 @@ fn encode(
     backend: &Backend,
     trace: &mut Trace<'_>,
 ) -> Result<BackboneOutput> {
-    #[cfg(feature = "gpu")]
     if let Some(gpu) = Executor::new(backend) {
         return encoder.forward_on(views, &gpu.upload(&views.images)?, trace)?.to_host();
     }
-    #[cfg(not(feature = "gpu"))]
-    let Backend::Cpu = backend;
     encoder.forward(views, trace)
 }
 

@@ -28,7 +28,6 @@ use super::mlp::Mode;
 use crate::network::config::{
     Aggregation as Keys, AggregationAblations, FeatureLevel, HeadInput, MaskMode,
 };
-#[cfg(feature = "gpu")]
 use crate::network::ops::TapeArray;
 use crate::network::ops::attention_gather::{Deferred, Level};
 use crate::network::ops::{Array, Backend};
@@ -152,7 +151,6 @@ impl<A: Array> Prepared<A> {
     }
 }
 
-#[cfg(feature = "gpu")]
 impl Prepared<TapeArray> {
     /// Returns the same maps as leaves of tapes.
     pub fn leaves(&self) -> Self {
@@ -229,13 +227,11 @@ impl Aggregation {
     }
 
     /// Returns the feature maps that the aggregation reads.
-    #[cfg(feature = "gpu")]
     pub fn levels(&self) -> &[FeatureLevel] {
         &self.levels
     }
 
     /// Returns whether a GPU computes the gradients too: the form of the presets.
-    #[cfg(feature = "gpu")]
     pub(super) fn trains_on_device(&self) -> bool {
         matches!(self.plan, Plan::Preset(_))
     }

@@ -4,7 +4,6 @@
 //! packed rows in the order of the parents, each with the index of its parent. Optical depth
 //! ([`crate::network::config::OpacityRule`]) makes neighbours of different K agree.
 
-#[cfg(feature = "gpu")]
 use super::DeviceParents;
 use super::{Parts, Records, Scene, Span, Trunk};
 use crate::network::model::geometry::ParentChunk;
@@ -14,7 +13,6 @@ use crate::network::model::trace::Checkpoint;
 use crate::network::model::{BackboneOutput, Primaries, Views};
 use crate::network::ops::Array;
 use crate::scene::splats::Splats;
-#[cfg(feature = "gpu")]
 use candle_core::Tensor;
 use candle_core::{DType, Result, bail};
 use rayon::prelude::*;
@@ -78,7 +76,6 @@ impl Trunk {
     ///
     /// # Errors
     /// Those of [`Trunk::forward_mixed`].
-    #[cfg(feature = "gpu")]
     pub(in crate::network::model) fn device_mixed(
         &self,
         views: &Views,
@@ -135,7 +132,6 @@ impl Trunk {
         if primaries.means.dtype() != DType::F32 {
             bail!("primaries: expected f32, got {:?}", primaries.means.dtype());
         }
-        #[cfg(feature = "gpu")]
         if let Some(result) = self.on_device(|executor| {
             let like = |t: &Tensor| executor.upload(t);
             let scene = self.scene_on(parts, views, backbone, primaries, like)?;

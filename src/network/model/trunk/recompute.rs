@@ -10,7 +10,6 @@
 //! a dense gradient of a chunk would be mostly zeros.
 
 use super::{Children, Parts, Records, Scene, Span, TrainPass, Trunk, chunks, interleaved};
-#[cfg(feature = "gpu")]
 use crate::network::model::aggregation::Prepared;
 use crate::network::model::geometry::ParentChunk;
 use crate::network::model::mlp::Mode;
@@ -18,7 +17,6 @@ use crate::network::model::{BackboneOutput, Primaries, Views};
 use crate::network::ops::attention_gather::Deferred;
 use crate::network::ops::precomputed_gradient::precomputed_gradient;
 use crate::network::ops::spgr::spgr_on;
-#[cfg(feature = "gpu")]
 use crate::network::ops::{Array, TapeArray};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var, bail};
@@ -27,7 +25,6 @@ use subsplat_kernels::layout::SPLAT_STRIDE;
 
 /// Parents per chunk on a GPU. The tape of a chunk holds about 30 activations `[8192, 128]`, 4 MiB
 /// each.
-#[cfg(feature = "gpu")]
 const CHUNK_GPU: usize = 1 << 13;
 
 /// State of [`Trunk::forward_recomputed`] for the backward pass.
@@ -40,7 +37,6 @@ pub struct Recomputed<'a> {
     seed: u64,
     children: Children,
     /// The same parents on the GPU that computed the children.
-    #[cfg(feature = "gpu")]
     device: Option<Scene<'a, TapeArray>>,
 }
 
@@ -62,7 +58,6 @@ impl Trunk {
     /// Returns whether the trunk's GPU computes its training pass. The CPU computes that of an
     /// aggregation that neither preset uses.
     pub fn trains_on_device(&self) -> bool {
-        #[cfg(feature = "gpu")]
         if self.executor.is_some() {
             let aggregation = self.parts().and_then(|parts| parts.aggregation.as_ref());
             return aggregation
@@ -90,7 +85,6 @@ impl Trunk {
         let scene = self.scene(parts, views, backbone, primaries)?;
         let sh = interleaved(&primaries.sh)?;
         let mode = Mode::Train { seed };
-        #[cfg(feature = "gpu")]
         if self.trains_on_device()
             && let Some(result) = self.on_device(|executor| {
                 // Feature maps are leaves of the tape; the parents' gradients are requested by chunk.
@@ -118,7 +112,6 @@ impl Trunk {
             chunk: chunk.max(1),
             seed,
             children,
-            #[cfg(feature = "gpu")]
             device: None,
         })
     }
@@ -143,7 +136,6 @@ impl<'a> Scene<'a> {
     }
 }
 
-#[cfg(feature = "gpu")]
 impl Scene<'_, TapeArray> {
     /// Returns the same arrays, of which only the maps belong to a tape.
     fn without_parents_tape(self) -> Self {
@@ -190,7 +182,6 @@ impl Recomputed<'_> {
             return Err(candle_core::Error::Msg(text).into());
         }
         let wanted = inputs(&self.scene).iter().any(|t| t.track_op());
-        #[cfg(feature = "gpu")]
         if let Some(scene) = &self.device {
             return Ok(self.backward_on(scene, [rows, gain], wanted)?);
         }
@@ -233,7 +224,6 @@ impl Recomputed<'_> {
 
     /// Computes [`Recomputed::backward`] on the GPU of `scene`. The scalars carry the parameters'
     /// gradients too.
-    #[cfg(feature = "gpu")]
     fn backward_on(
         &self,
         scene: &Scene<'_, TapeArray>,

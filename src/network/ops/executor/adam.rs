@@ -11,6 +11,7 @@
 
 use super::{Executor, TapeArray};
 use crate::network::ops::Array;
+use crate::network::ops::device::{ParameterStep, SharedStep};
 use candle_core::{Result, Tensor, bail};
 use std::ops::Range;
 use std::sync::{Arc, PoisonError};
@@ -26,30 +27,6 @@ pub struct DeviceAdam {
     owners: Vec<u32>,
     /// Values, first moments, second moments, averages.
     state: [TapeArray; 4],
-}
-
-/// Constants of a step ([`subsplat_kernels::cpu::adam::AdamStep`]) that all parameters share.
-#[derive(Clone, Copy, Debug)]
-pub struct SharedStep {
-    /// Factor of the gradients.
-    pub clip: f32,
-    /// Decay of the first and of the second moment.
-    pub betas: [f32; 2],
-    /// Term added to the root of the second moment.
-    pub epsilon: f32,
-    /// Decay of the moving average.
-    pub average: f32,
-}
-
-/// Constants of a step for one parameter that changes.
-#[derive(Clone, Copy, Debug)]
-pub struct ParameterStep {
-    /// Learning rate with bias correction.
-    pub rate: f32,
-    /// Factor of the root of the second moment.
-    pub root: f32,
-    /// Factor of the values.
-    pub keep: f32,
 }
 
 impl DeviceAdam {

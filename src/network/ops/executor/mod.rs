@@ -16,8 +16,7 @@ mod scene;
 mod small_array;
 mod tape;
 
-pub use adam::{DeviceAdam, ParameterStep, SharedStep};
-pub use scene::{ColourLayout, DeviceSplats};
+pub use adam::DeviceAdam;
 pub use tape::DeviceGradients;
 
 use super::Backend;

@@ -6,6 +6,7 @@
 use super::{Executor, TapeArray};
 use crate::network::ops::adapter::{Adapter, Turn, View};
 use crate::network::ops::check_raster_options;
+use crate::network::ops::device::{ColourLayout, DeviceSplats};
 use crate::network::ops::spgr::Spgr;
 use candle_core::{Device, Result, Tensor};
 use std::sync::Arc;
@@ -13,28 +14,6 @@ use subsplat_kernels::camera::Camera;
 use subsplat_kernels::gpu;
 use subsplat_kernels::gpu::{AdapterCall, AdapterView, SceneArrays};
 use subsplat_kernels::layout::RasterOptions;
-
-/// SH of primaries in device memory ([`TapeArray::placed_colours`]).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ColourLayout {
-    /// World frame, `[N, D, 3]`.
-    World,
-    /// World frame, colour-major `[N, 3, D]`.
-    WorldByColour,
-    /// Frame of the source view, `[N, 3, D]`.
-    Camera,
-}
-
-/// Consecutive Gaussians of one scene in device memory.
-#[derive(Clone, Debug)]
-pub struct DeviceSplats {
-    /// `[n·K, 11]`, columns as in [`subsplat_kernels::layout`].
-    pub rows: TapeArray,
-    /// `[n, D, 3]`: the parents' SH, world frame.
-    pub sh: TapeArray,
-    /// `[n·K, 1]` or `[n·K, 4]`; `None` for gains of 1.
-    pub gain: Option<TapeArray>,
-}
 
 fn call(adapter: &Adapter) -> AdapterCall {
     AdapterCall {

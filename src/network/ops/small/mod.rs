@@ -15,6 +15,7 @@ pub use array::SmallArray;
 pub use convex::upsample_convex;
 pub use cross_check::cross_check;
 pub use depth_consensus::depth_consensus;
+#[cfg(feature = "gpu")]
 pub(in crate::network::ops) use depth_consensus::tolerances as consensus_tolerances;
 #[cfg(feature = "gpu")]
 pub(in crate::network::ops) use expectation::SCORE_GAIN;

@@ -12,9 +12,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::hash::Hasher;
 use std::ops::Range;
-#[cfg(feature = "gpu")]
 use std::sync::Arc;
-#[cfg(feature = "gpu")]
 use subsplat::network::ops::{Backend, DeviceAdam, Executor, ParameterStep, SharedStep};
 use subsplat_kernels::cpu::adam::AdamStep;
 
@@ -80,12 +78,10 @@ pub struct Optimizer {
     /// is not updated.
     updates: Vec<u64>,
     /// The same state in device memory.
-    #[cfg(feature = "gpu")]
     device: Option<OnDevice>,
 }
 
 /// The state on a GPU.
-#[cfg(feature = "gpu")]
 #[derive(Debug)]
 struct OnDevice {
     executor: Arc<Executor>,
@@ -187,7 +183,6 @@ impl Optimizer {
             second: vec![0.0; n],
             average: values.clone(),
             values,
-            #[cfg(feature = "gpu")]
             device: None,
         })
     }
@@ -197,7 +192,6 @@ impl Optimizer {
     ///
     /// # Errors
     /// Those of the parameters' tensors.
-    #[cfg(feature = "gpu")]
     pub fn set_device(&mut self, executor: &Arc<Executor>, backend: &Backend) -> Result<()> {
         self.device = None;
         let moved: Option<Result<DeviceAdam>> = executor.attempt(backend, || {
@@ -219,7 +213,6 @@ impl Optimizer {
     }
 
     /// Runs `f` on the GPU; `None` where there is none or it failed, and the CPU goes on for good.
-    #[cfg(feature = "gpu")]
     fn on_device<R>(&mut self, f: impl FnOnce(&DeviceAdam) -> Result<R>) -> Result<Option<R>> {
         let Some(OnDevice { executor, backend, adam }) = &self.device else { return Ok(None) };
         match executor.attempt(backend, || f(adam)) {
@@ -235,10 +228,7 @@ impl Optimizer {
 
     /// Returns whether a GPU has the state.
     pub fn is_on_device(&self) -> bool {
-        #[cfg(feature = "gpu")]
-        return self.device.is_some();
-        #[cfg(not(feature = "gpu"))]
-        return false;
+        self.device.is_some()
     }
 
     /// Returns the norm of all gradients together, computed where the state is.
@@ -246,7 +236,6 @@ impl Optimizer {
     /// # Errors
     /// Gradients of other parameters.
     pub fn norm(&mut self, gradients: &Gradients) -> Result<f64> {
-        #[cfg(feature = "gpu")]
         if let Some(norm) = self.on_device(|adam| adam.norm(&gradients.sum))? {
             return Ok(norm);
         }
@@ -344,7 +333,6 @@ impl Optimizer {
     }
 
     /// Takes a step on the GPU and copies its results; false where the CPU must take it.
-    #[cfg(feature = "gpu")]
     fn step_on_device(
         &mut self,
         gradients: &Gradients,
@@ -363,12 +351,6 @@ impl Optimizer {
         };
         [self.values, self.first, self.second, self.average] = state;
         Ok(true)
-    }
-
-    #[cfg(not(feature = "gpu"))]
-    #[expect(clippy::unnecessary_wraps, reason = "the signature of the GPU's version")]
-    fn step_on_device(&mut self, _: &Gradients, _: &[Option<AdamStep>]) -> Result<bool> {
-        Ok(false)
     }
 
     /// Returns the moving average of the weights, by the model's names.
@@ -421,7 +403,6 @@ impl Optimizer {
         }
         let updates = take_tensor(&mut state, UPDATES, &[self.slots.len()])?.to_vec1::<f32>()?;
         self.updates = updates.into_iter().map(|u| u as u64).collect();
-        #[cfg(feature = "gpu")]
         if let Some(OnDevice { executor, backend, .. }) = self.device.take() {
             self.set_device(&executor, &backend)?;
         }

@@ -211,7 +211,6 @@ impl Training {
             optimizer.restore(old.state)?;
             progress = old.progress;
         }
-        #[cfg(feature = "gpu")]
         if let Some(executor) = learner.executor() {
             optimizer.set_device(executor, learner.backend())?;
         }

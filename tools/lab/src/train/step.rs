@@ -10,7 +10,6 @@ use super::{Error, Result};
 use crate::lpips::Lpips;
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor};
-#[cfg(feature = "gpu")]
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -24,7 +23,6 @@ use subsplat::network::model::trunk::{Children, TrainPass};
 use subsplat::network::model::weights::Weights;
 use subsplat::network::model::{BackboneOutput, Views};
 use subsplat::network::ops::Backend;
-#[cfg(feature = "gpu")]
 use subsplat::network::ops::Executor;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::clock::Instant;
@@ -268,7 +266,6 @@ impl Learner {
     }
 
     /// Returns the GPU of the configured device, if it is one.
-    #[cfg(feature = "gpu")]
     pub(super) fn executor(&self) -> Option<&Arc<Executor>> {
         self.model.trunk().executor()
     }
@@ -343,7 +340,6 @@ impl Learner {
         scale: StepScale,
         optimizer: &Optimizer,
     ) -> Result<GroupSum> {
-        #[cfg(feature = "gpu")]
         if let Some(executor) = self.model.trunk().executor()
             && let Some(result) = executor
                 .attempt(&self.backend, || self.group_with(&self.model, group, scale, optimizer))
