@@ -24,7 +24,6 @@ use rival::{Rival, median, timed};
 use stages::Stages;
 use std::ops::ControlFlow;
 use subsplat::FitOptions;
-use subsplat::files::image::Rgb;
 use subsplat::network::config::{Config, Mvsplat as Settings, Preset, Small};
 use subsplat::network::model::Views;
 use subsplat::network::model::backbone::{DisparityMean, Mvsplat, SmallBackbone};
@@ -33,6 +32,7 @@ use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::{
     Check, DepthBounds, Detail, Options, Photo, Progress, Reconstructor, Stage,
 };
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::NearFar;
 use subsplat_kernels::cpu::SimdLevel;
 

@@ -96,15 +96,16 @@ pub use crate::reconstruct::{
     Progress, Quality, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
     estimate_cameras, estimate_cameras_of_files,
 };
-pub use files::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};
-pub use files::photograph::{Photograph, load_photograph, parse_photograph};
-pub use files::scene::{Frame, Scene, load_scene};
+pub use files::photos::image::{LoadOptions, save_depth_png, save_png};
+pub use files::photos::photograph::{Photograph, load_photograph, parse_photograph};
+pub use files::poses::scene::{Frame, Scene, load_scene};
 pub use files::{
     Error as FileError, SaveOptions, SplatFormat, Up, encode_splats, load_splats, parse_splats,
     save_splats,
 };
 pub use finish::{FinishError, FitOptions, TargetView};
 pub use scene::navigation::Bounds;
+pub use scene::pictures::{Depth, Rgb};
 pub use scene::render::{Picture, Renderer, render};
 pub use scene::splats::{Splats, SplatsError};
 pub use subsplat_kernels::backend::{Backend, DeviceError};

@@ -1,5 +1,5 @@
 """Prints what OpenCV says of a few rays through distorted lenses, for the table in
-src/files/undistort.rs (`distort_is_opencvs`).
+src/files/photos/undistort.rs (`distort_is_opencvs`).
 
     pip install numpy opencv-python-headless && python tools/make_distortion_golden.py
 """

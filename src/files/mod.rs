@@ -9,41 +9,15 @@
 //! Foreign conventions end here and in the network's `primaries.rs`. Every binary reader has a `parse_*` of
 //! bytes, which tests and fuzz targets call.
 
-pub mod compressed_ply;
-mod gaussians;
-pub mod glb;
-mod glb_read;
-pub mod ksplat;
-pub mod ply;
-mod ply_container;
-pub mod splat;
+pub mod photos;
+pub mod poses;
 pub mod splats;
-pub mod spz;
+pub mod weights;
 
 pub use splats::{
     SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, encode_splats, encode_splats_with,
     load_splats, load_with_comments, parse_splats, save_splats, splat_info,
 };
-mod assemble;
-pub mod cameras_json;
-pub mod colmap;
-mod decode;
-pub mod exif;
-mod heic;
-mod icc;
-pub mod image;
-mod jpeg;
-pub mod matrices;
-pub mod photograph;
-pub mod protocol;
-pub mod re10k;
-pub mod resize;
-mod rgb_image;
-pub mod scene;
-pub mod tensors;
-pub mod torch;
-pub mod transforms;
-pub mod undistort;
 
 use std::fs::File;
 use std::io::{BufWriter, Write};

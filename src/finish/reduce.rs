@@ -18,7 +18,7 @@
 use super::TargetView;
 use super::merge::{Blob, CURVE_BITS, curve_code, folded};
 use super::removal::shares;
-use crate::files::image::Rgb;
+use crate::scene::pictures::Rgb;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use glam::{DMat3, DVec3, Vec2, Vec3};

@@ -2,7 +2,7 @@
 
 use super::FinishError;
 use super::loss::{Scored, dssim, mse};
-use crate::files::image::Rgb;
+use crate::scene::pictures::Rgb;
 use crate::scene::splats::Splats;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;

@@ -16,7 +16,7 @@
 //! out: lowering the opacity of contradicted points costs 0.3 dB with sources weighed by visibility, and
 //! agreement merges only a tenth of the Gaussians. The shares are gradients by colour offsets.
 
-use crate::files::resize::{Filter, resize};
+use crate::files::photos::resize::{Filter, resize};
 use crate::reconstruct::inputs::crop::Cropped;
 use rayon::prelude::*;
 
@@ -192,8 +192,8 @@ fn variances(input: &Cropped, grids: &[usize]) -> Vec<Vec<f32>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::files::image::Rgb;
     use crate::reconstruct::inputs::crop::{CropOptions, crop};
+    use crate::scene::pictures::Rgb;
     use glam::Mat4;
     use subsplat_kernels::camera::{Camera, Intrinsics};
 

@@ -15,7 +15,7 @@
 
 use super::{Error, Result};
 use crate::cameras::check::{PairReport, Verdict};
-use crate::files::scene::{Scene, Units};
+use crate::files::poses::scene::{Scene, Units};
 use crate::reconstruct::inputs::pair::{points_in_view, quantile};
 use std::fmt;
 use subsplat_kernels::camera::{Camera, NearFar};

@@ -3,10 +3,10 @@
 
 use super::{Error, Photo, Result};
 use crate::cameras::estimation::{Lens, PoseEstimate, PoseOptions, PosePhoto, estimate_poses};
-use crate::files::exif::FocalSource;
-use crate::files::image::LoadOptions;
-use crate::files::photograph::{Photograph, load_photograph};
-use crate::files::scene::{Scene, SceneFormat};
+use crate::files::photos::exif::FocalSource;
+use crate::files::photos::image::LoadOptions;
+use crate::files::photos::photograph::{Photograph, load_photograph};
+use crate::files::poses::scene::{Scene, SceneFormat};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use subsplat_kernels::camera::{Camera, Intrinsics};
@@ -95,7 +95,7 @@ fn features_of(photographs: usize) -> usize {
 
 /// Estimates the cameras of photographs in memory, for
 /// [`Reconstructor::run`](super::Reconstructor::run).
-/// [`parse_photograph`](crate::files::photograph::parse_photograph) decodes files in memory.
+/// [`parse_photograph`](crate::files::photos::photograph::parse_photograph) decodes files in memory.
 ///
 /// # Errors
 /// A lens that is no valid camera; [`Error::NoPoses`].

@@ -103,8 +103,8 @@ fn is_worth(exposure: &Exposure) -> bool {
 mod tests {
     use super::*;
     use crate::cameras::check::MatchedPoint;
-    use crate::files::image::Rgb;
     use crate::reconstruct::inputs::crop::{CropOptions, crop};
+    use crate::scene::pictures::Rgb;
     use glam::Mat4;
     use subsplat_kernels::camera::{Camera, Intrinsics};
 

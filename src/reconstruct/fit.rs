@@ -1,12 +1,12 @@
 //! Fit and refinement of a reconstructed scene on its photographs.
 
 use super::{Error, Refine, Result};
-use crate::files::image::Rgb;
 use crate::finish::{
     FinishError, FitOptions, FitReport, Groups, RefineOptions, RefineReport, Refiner, TargetView,
     check_time, fit, refine_groups,
 };
 use crate::reconstruct::inputs::crop::Cropped;
+use crate::scene::pictures::Rgb;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use std::ops::ControlFlow;

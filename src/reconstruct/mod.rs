@@ -4,7 +4,7 @@
 //! use std::ops::ControlFlow;
 //! use subsplat::reconstruct::{DepthBounds, Options, Photo, Reconstructor};
 //! # fn main() -> subsplat::Result<()> {
-//! let scene = subsplat::files::scene::load_scene("scene")?;
+//! let scene = subsplat::files::poses::scene::load_scene("scene")?;
 //! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
 //! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
 //! let model = Reconstructor::load("weights.safetensors", None)?;

@@ -1,10 +1,11 @@
 //! A photograph with its camera.
 
 use super::{Error, Result};
-use crate::files::image::{LoadOptions, Rgb};
-use crate::files::photograph::Photograph;
-use crate::files::scene::{Frame, LoadedFrame};
+use crate::files::photos::image::LoadOptions;
+use crate::files::photos::photograph::Photograph;
+use crate::files::poses::scene::{Frame, LoadedFrame};
 use crate::reconstruct::inputs::crop::{CropOptions, Cropped, crop};
+use crate::scene::pictures::Rgb;
 use std::sync::Arc;
 use subsplat_kernels::camera::{Camera, Size};
 

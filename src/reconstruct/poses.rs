@@ -3,7 +3,7 @@
 use super::{Error, Photo, Result};
 use crate::cameras::check::{CheckOptions, Finding, GrayImage, PairReport, Verdict, check_pair};
 use crate::cameras::estimation::{Lens, PoseAdjustment, PosePhoto, adjust_poses, locate_photos};
-use crate::files::image::Rgb;
+use crate::scene::pictures::Rgb;
 use rayon::prelude::*;
 use std::fmt;
 use subsplat_kernels::camera::Camera;

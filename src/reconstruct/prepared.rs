@@ -7,10 +7,10 @@ use super::{
 };
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
-use crate::files::image::{Depth, Rgb};
 use crate::finish::Refiner;
 use crate::network::model::Views;
 use crate::reconstruct::inputs::crop::Cropped;
+use crate::scene::pictures::{Depth, Rgb};
 use crate::scene::render::Renderer;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::Camera;

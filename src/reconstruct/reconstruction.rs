@@ -3,10 +3,10 @@
 use super::{DepthBounds, Detail, Refine, Result, StageTime, Warning, refine_on_inputs};
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
-use crate::files::image::Depth;
 use crate::files::{SaveOptions, SaveReport, save_splats};
 use crate::finish::{FitReport, Groups, RefineReport, Refiner};
 use crate::reconstruct::inputs::crop::Cropped;
+use crate::scene::pictures::Depth;
 use crate::scene::render::{Picture, Renderer, comment_of_camera, comment_of_options, render};
 use crate::scene::splats::Splats;
 use std::ops::ControlFlow;

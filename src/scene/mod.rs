@@ -3,6 +3,7 @@
 pub mod levels;
 pub mod metrics;
 pub mod navigation;
+pub mod pictures;
 pub mod render;
 pub mod score;
 pub mod splats;

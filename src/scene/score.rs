@@ -2,7 +2,7 @@
 
 use super::metrics::{MetricsError, gmsd, mean_gradient, psnr, ssim};
 use super::splats::SplatStatistics;
-use crate::files::image::Rgb;
+use crate::scene::pictures::Rgb;
 use serde::Serialize;
 
 /// Similarity of a picture to the photograph.

@@ -9,7 +9,7 @@ use adapter::gpu;
 use std::path::PathBuf;
 use subsplat::FitOptions;
 use subsplat::files::load_splats;
-use subsplat::files::scene::{Scene, load_scene};
+use subsplat::files::poses::scene::{Scene, load_scene};
 use subsplat::network::model::Backend;
 use subsplat::reconstruct::{Check, DepthRange, Options, Photo, Reconstructor};
 use subsplat::scene::metrics::psnr;

@@ -6,12 +6,12 @@ use subsplat_test_support::whole;
 
 use candle_core::{Device, Tensor};
 use glam::Vec3;
-use subsplat::files::image::Rgb;
 use subsplat::files::{SaveOptions, load_splats, save_splats};
 use subsplat::network::config::{Backbone, Config, Preset, ShFrame, SpgrHead};
 use subsplat::network::model::Views;
 use subsplat::reconstruct::{Density, Photo, Reconstructor};
 use subsplat::scene::metrics::psnr;
+use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render;
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar, Size};

@@ -2,8 +2,8 @@
 //! leaves a set alone where it cannot make it better.
 
 use std::ops::ControlFlow;
-use subsplat::files::image::Rgb;
 use subsplat::finish::{FitReport, fit};
+use subsplat::scene::pictures::Rgb;
 use subsplat::{FinishError, FitOptions, RasterOptions, Renderer, Splats, TargetView};
 use subsplat_kernels::layout::{OPACITY_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use subsplat_test_support::fit_scene::{SIDE, cameras, pictures, plane};

@@ -4,8 +4,8 @@
 use glam::Mat4;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
-use subsplat::files::image::Rgb;
 use subsplat::finish::{RefineOptions, RefineReport, Refiner, refine};
+use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render;
 use subsplat::{Camera, FinishError, RasterOptions, Renderer, Splats, TargetView};
 use subsplat_kernels::layout::{OPACITY_OFFSET, QUAT_OFFSET, SPLAT_STRIDE};

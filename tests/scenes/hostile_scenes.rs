@@ -8,14 +8,15 @@ use subsplat_test_support::noise;
 use made_up::made_up;
 use serde_json::{Value, json};
 use std::path::Path;
-use subsplat::files::cameras_json::{CameraFile, save_cameras_json};
-use subsplat::files::colmap::{
+use subsplat::files::photos::image;
+use subsplat::files::poses::cameras_json::{CameraFile, save_cameras_json};
+use subsplat::files::poses::colmap::{
     parse_cameras_bin, parse_cameras_txt, parse_images_bin, parse_images_txt, parse_points_bin,
     parse_points_txt,
 };
-use subsplat::files::protocol::{load_index, load_protocol};
-use subsplat::files::scene::{Units, load_scene};
-use subsplat::files::{image, re10k};
+use subsplat::files::poses::protocol::{load_index, load_protocol};
+use subsplat::files::poses::re10k;
+use subsplat::files::poses::scene::{Units, load_scene};
 use subsplat_kernels::layout::random;
 
 /// Asserts an error of one line that contains all of `words`.
@@ -454,7 +455,7 @@ fn colmap_binary_with_hostile_fields() {
     };
     let trillion = 1_000_000_000_000u64.to_le_bytes();
     let nan = f64::NAN.to_le_bytes();
-    // Offsets follow the layouts in src/files/colmap/binary.rs. The name of a picture has seven
+    // Offsets follow the layouts in src/files/poses/colmap/binary.rs. The name of a picture has seven
     // letters and a terminator here.
     let observations = 8 + 4 + 56 + 4 + 8;
     let cases: Vec<(&str, usize, Vec<u8>, &[&str])> = vec![

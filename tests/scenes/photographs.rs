@@ -7,21 +7,22 @@ use glam::{DMat3, DVec3, Mat4};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use moxcms::{ColorProfile, ToneReprCurve};
 use std::path::{Path, PathBuf};
-use subsplat::files::cameras_json::{
-    CameraFile, NamedCamera, load_cameras_json, save_cameras_json,
-};
-use subsplat::files::exif::{FocalSource, parse_exif};
-use subsplat::files::image;
-use subsplat::files::image::{LoadOptions, Rgb, Truncated};
-use subsplat::files::photograph::{
+use subsplat::files::photos::exif::{FocalSource, parse_exif};
+use subsplat::files::photos::image;
+use subsplat::files::photos::image::{LoadOptions, Truncated};
+use subsplat::files::photos::photograph::{
     Photograph, load_photograph, parse_photograph, probe_photograph,
 };
-use subsplat::files::scene::{Pixels, Scene, Units, load_scene};
+use subsplat::files::poses::cameras_json::{
+    CameraFile, NamedCamera, load_cameras_json, save_cameras_json,
+};
+use subsplat::files::poses::scene::{Pixels, Scene, Units, load_scene};
 use subsplat::image as image_crate;
 use subsplat::image::codecs::png::PngEncoder;
 use subsplat::image::codecs::tiff::TiffEncoder;
 use subsplat::image::codecs::webp::WebPEncoder;
 use subsplat::image::{ExtendedColorType, ImageEncoder};
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Makes an EXIF block.

@@ -3,7 +3,7 @@
 use subsplat_test_support::noise;
 
 use noise::noise;
-use subsplat::files::resize::{Filter, resize};
+use subsplat::files::photos::resize::{Filter, resize};
 
 #[test]
 fn resampling_equals_pillow() {

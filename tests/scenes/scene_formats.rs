@@ -8,14 +8,14 @@ use glam::{Mat4, Vec3};
 use made_up::made_up;
 use noise::noise;
 use std::path::PathBuf;
-use subsplat::files::cameras_json::{
+use subsplat::files::photos::image;
+use subsplat::files::photos::undistort::Distortion;
+use subsplat::files::poses::cameras_json::{
     CameraFile, NamedCamera, load_cameras_json, save_cameras_json,
 };
-use subsplat::files::image;
-use subsplat::files::matrices;
-use subsplat::files::matrices::PoseConvention;
-use subsplat::files::scene::{Scene, SceneFormat, Units, load_scene};
-use subsplat::files::undistort::Distortion;
+use subsplat::files::poses::matrices;
+use subsplat::files::poses::matrices::PoseConvention;
+use subsplat::files::poses::scene::{Scene, SceneFormat, Units, load_scene};
 use subsplat::reconstruct::inputs::pair::choose_pair;
 use subsplat::reconstruct::{DepthBounds, DepthRange};
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
@@ -383,7 +383,7 @@ fn names_are_sorted_by_their_numbers() {
     for name in ["images/0.png", "images/7.png"] {
         image::save_png(at(name), &noise(12, 8)).unwrap();
     }
-    let x = |f: &subsplat::files::scene::Frame| -f.camera.position().x;
+    let x = |f: &subsplat::files::poses::scene::Frame| -f.camera.position().x;
     let scene = load_scene(at("a.txt")).unwrap();
     assert_eq!(scene.frames.iter().map(x).collect::<Vec<_>>(), [0.0, 7.0]);
 }

@@ -6,14 +6,14 @@ use subsplat_test_support as common;
 use common::shared;
 use glam::{DMat4, Vec2};
 use std::path::Path;
-use subsplat::files::image;
-use subsplat::files::image::Rgb;
-use subsplat::files::protocol::{load_index, load_protocol};
-use subsplat::files::scene::{Scene, SceneFormat, Units, load_scene};
-use subsplat::files::undistort::{Distortion, undistort};
+use subsplat::files::photos::image;
+use subsplat::files::photos::undistort::{Distortion, undistort};
+use subsplat::files::poses::protocol::{load_index, load_protocol};
+use subsplat::files::poses::scene::{Scene, SceneFormat, Units, load_scene};
 use subsplat::reconstruct::inputs::crop::{CropOptions, CropRule, crop};
 use subsplat::reconstruct::inputs::pair::{choose_pair, view_geometry};
 use subsplat::reconstruct::{DepthBounds, DepthRange};
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 const SCENES: [&str; 9] = [

@@ -7,7 +7,7 @@ use common::{npy, shared};
 use glam::{DMat3, DVec3};
 use splat_scene::*;
 use std::io::Read;
-use subsplat::files::ply::parse_ply;
+use subsplat::files::splats::ply::parse_ply;
 use subsplat::files::{SaveOptions, load_splats, save_splats, splat_info};
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::layout::ShBasis;
@@ -418,7 +418,7 @@ fn spz_rotations_and_positions_of_old_versions() {
         b
     };
     for version in [1, 2] {
-        let s = subsplat::files::spz::parse_spz(&body(version), "old.spz").unwrap();
+        let s = subsplat::files::splats::spz::parse_spz(&body(version), "old.spz").unwrap();
         // Ours are turned by half a turn about x.
         assert_eq!(s.mean(0), [1.5, 2.25, -0.5]);
         let [sx, sy, sz] = s.scale(0).map(|v| f64::from(v).ln());
@@ -476,7 +476,7 @@ fn ksplat_buckets_and_harmonics() {
                 }
             }
         }
-        let s = subsplat::files::ksplat::parse_ksplat(&b, "a.ksplat").unwrap();
+        let s = subsplat::files::splats::ksplat::parse_ksplat(&b, "a.ksplat").unwrap();
         assert_eq!((s.len(), s.sh_degree()), (3, 1));
         for (i, centre) in
             [[10.0, 20.0, 30.0], [10.0, 20.0, 30.0], [-10.0, -20.0, -30.0]].into_iter().enumerate()

@@ -5,7 +5,7 @@ use subsplat_test_support::torch_writer as writer;
 
 use std::path::Path;
 use std::time::{Duration, Instant};
-use subsplat::files::torch::{TorchFile, Value};
+use subsplat::files::weights::torch::{TorchFile, Value};
 use writer::*;
 
 /// Opens `bytes` and reads every tensor found, within bounds of time.

@@ -7,7 +7,7 @@ use subsplat_test_support::torch_writer as writer;
 use common::shared;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use subsplat::files::torch::{Form, TorchDtype, TorchFile, Value};
+use subsplat::files::weights::torch::{Form, TorchDtype, TorchFile, Value};
 use writer::*;
 
 fn goldens() -> PathBuf {

@@ -11,9 +11,9 @@
 //! the height: the rounding makes them differ slightly). [`CropRule`] says what becomes
 //! of the principal point.
 
-use crate::files::image::Rgb;
-use crate::files::resize::{Filter, Window, resize, resize_window};
+use crate::files::photos::resize::{Filter, Window, resize, resize_window};
 use crate::files::{Error, Result};
+use crate::scene::pictures::Rgb;
 use glam::Vec2;
 use subsplat_kernels::camera::{Camera, CameraError, Intrinsics, Size};
 

@@ -17,7 +17,7 @@
 //! Samples of a narrow brightness range do not separate gain and offset; the gain alone is
 //! estimated from them. A correction that does not exceed the noise is replaced by the identity.
 
-use crate::files::image::Rgb;
+use crate::scene::pictures::Rgb;
 use thiserror::Error;
 
 /// A matched pair of points, px of each picture (pixel centres at +0.5).

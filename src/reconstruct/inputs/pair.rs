@@ -14,7 +14,7 @@
 //! Of many photographs, each is compared with its two best partners (`choose_sources`), not with all: the time
 //! grows with twice the number of photographs, and wide pairs harm.
 
-use crate::files::scene::{Scene, Units};
+use crate::files::poses::scene::{Scene, Units};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 use subsplat_kernels::camera::{Camera, NearFar};
@@ -288,8 +288,8 @@ pub fn quantile(values: &mut [f32], q: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::files::scene::{Frame, Pixels, SceneFormat};
-    use crate::files::undistort::Distortion;
+    use crate::files::photos::undistort::Distortion;
+    use crate::files::poses::scene::{Frame, Pixels, SceneFormat};
     use glam::{Mat4, Quat};
     use subsplat_kernels::camera::Intrinsics;
 

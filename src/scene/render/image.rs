@@ -1,7 +1,7 @@
 //! A rendered view as an 8-bit picture.
 
 use super::Picture;
-use crate::files::image::Rgb;
+use crate::scene::pictures::Rgb;
 use image::RgbImage;
 
 impl From<&Picture> for RgbImage {

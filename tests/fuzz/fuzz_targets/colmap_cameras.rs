@@ -5,5 +5,5 @@
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::colmap::parse_cameras_bin("fuzz", bytes);
+    let _ = subsplat::files::poses::colmap::parse_cameras_bin("fuzz", bytes);
 });

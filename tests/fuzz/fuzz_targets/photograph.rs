@@ -1,10 +1,10 @@
-//! `subsplat::files::photograph::parse_photograph` on arbitrary bytes: an answer, never a panic.
+//! `subsplat::files::photos::photograph::parse_photograph` on arbitrary bytes: an answer, never a panic.
 #![no_main]
 
-use subsplat::files::image::{LoadOptions, Truncated};
+use subsplat::files::photos::image::{LoadOptions, Truncated};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     let options = LoadOptions { truncated: Truncated::Accept };
     let path = "fuzz.jpg";
-    let _ = subsplat::files::photograph::parse_photograph(bytes, &options, path);
+    let _ = subsplat::files::photos::photograph::parse_photograph(bytes, &options, path);
 });

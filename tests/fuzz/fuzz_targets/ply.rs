@@ -1,6 +1,6 @@
-//! `subsplat::files::ply::parse_ply` on arbitrary bytes: an answer, never a panic.
+//! `subsplat::files::splats::ply::parse_ply` on arbitrary bytes: an answer, never a panic.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::ply::parse_ply(bytes, "fuzz.ply");
+    let _ = subsplat::files::splats::ply::parse_ply(bytes, "fuzz.ply");
 });

@@ -1,7 +1,7 @@
 //! `subsplat::files::torch` on arbitrary bytes, every tensor read: an answer, never a panic.
 #![no_main]
 
-use subsplat::files::torch::TorchFile;
+use subsplat::files::weights::torch::TorchFile;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     let Ok(file) = TorchFile::parse(bytes, "fuzz.pt") else { return };

@@ -3,7 +3,8 @@
 use super::noise::noise;
 use super::torch_writer::{Checkpoint, Py, dict, text};
 use std::path::Path;
-use subsplat::files::image::{Rgb, png_bytes};
+use subsplat::files::photos::image::png_bytes;
+use subsplat::scene::pictures::Rgb;
 
 /// A video of a chunk.
 pub struct Video {

@@ -2,7 +2,7 @@
 
 use glam::DQuat;
 use std::path::Path;
-use subsplat::files::cameras_json::NamedCamera;
+use subsplat::files::poses::cameras_json::NamedCamera;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Model number, name, and parameters of a camera of 64×48 pixels.

@@ -1,7 +1,7 @@
 //! A textured plane before two cameras, for fits of Gaussians to pictures.
 
 use glam::{Mat4, Vec3};
-use subsplat::files::image::Rgb;
+use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render;
 use subsplat::{Camera, Intrinsics, RasterOptions, ShBasis, Splats};
 

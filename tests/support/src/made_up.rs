@@ -2,8 +2,8 @@
 
 use super::noise::noise;
 use glam::{Mat4, Quat, Vec3};
-use subsplat::files::cameras_json::NamedCamera;
-use subsplat::files::image;
+use subsplat::files::photos::image;
+use subsplat::files::poses::cameras_json::NamedCamera;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// A folder with `n` pictures of 64×48 and cameras that nothing is special about.

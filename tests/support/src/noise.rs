@@ -1,6 +1,6 @@
 //! A picture of noise.
 
-use subsplat::files::image::Rgb;
+use subsplat::scene::pictures::Rgb;
 
 /// The generator of tools/make_resize_golden.py.
 pub fn noise(width: usize, height: usize) -> Rgb {

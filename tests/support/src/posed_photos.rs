@@ -3,8 +3,8 @@
 use crate::shared;
 use std::path::{Path, PathBuf};
 use subsplat::cameras::estimation::{Lens, PosePhoto};
-use subsplat::files::protocol::load_protocol;
-use subsplat::files::scene::{Scene, load_scene};
+use subsplat::files::poses::protocol::load_protocol;
+use subsplat::files::poses::scene::{Scene, load_scene};
 use subsplat::{Photo, Rgb};
 use subsplat_kernels::camera::Camera;
 

@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
-use subsplat::files::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::files::image::{Rgb, save_png};
-use subsplat::files::scene::Units;
+use subsplat::files::photos::image::save_png;
+use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::files::poses::scene::Units;
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::{Camera, NearFar};
 use subsplat_lab::data::procedural::CameraSpec;
 use subsplat_lab::data::procedural::{Example, ExampleSpec};

@@ -4,7 +4,6 @@ use candle_core::{Device, Tensor};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::FitOptions;
 use subsplat::Picture;
-use subsplat::files::image::Rgb;
 use subsplat::network::config::{Backbone, Config, Preset};
 use subsplat::network::model::subsplat::SubSplat;
 use subsplat::network::model::weights::{Weights, save};
@@ -12,6 +11,7 @@ use subsplat::reconstruct::{
     Check, Density, DepthRange, Detail, Options, Photo, Reconstruction, Reconstructor,
 };
 use subsplat::scene::metrics::psnr;
+use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render;
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::{Camera, NearFar};

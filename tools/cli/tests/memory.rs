@@ -4,8 +4,8 @@ use subsplat_test_support::whole;
 
 use std::path::Path;
 use std::process::Command;
-use subsplat::files::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::files::image::save_png;
+use subsplat::files::photos::image::save_png;
+use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 
 /// Largest difference between the peaks of runs with small and with large photographs, MiB.
 const LARGE_PHOTOGRAPHS: f64 = 8.0;

@@ -8,9 +8,10 @@ use serde_json::json;
 use subsplat::cameras::check::{
     CheckOptions, GrayImage, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
 };
-use subsplat::files::image::{Rgb, save_png};
-use subsplat::files::scene::Scene;
+use subsplat::files::photos::image::save_png;
+use subsplat::files::poses::scene::Scene;
 use subsplat::reconstruct::inputs::pair::choose_pair;
+use subsplat::scene::pictures::Rgb;
 
 /// Runs the command; returns `false` where the poses are judged bad.
 pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {

@@ -4,7 +4,7 @@
 //! 2019), which keeps order in brightness at both ends and shows small steps.
 
 use crate::lettering::{HEIGHT, set_pixel, write};
-use subsplat::files::image::{Depth, Rgb};
+use subsplat::scene::pictures::{Depth, Rgb};
 
 /// Ends of the scale: quantiles of the depths that exist.
 const ENDS: [f64; 2] = [0.02, 0.98];

@@ -6,7 +6,7 @@ use super::render;
 use crate::report::{Answer, Progress, print_warning};
 use anyhow::{Result, bail};
 use serde_json::json;
-use subsplat::files::ply::is_own_comment;
+use subsplat::files::splats::ply::is_own_comment;
 use subsplat::files::{SaveOptions, load_with_comments, save_splats};
 use subsplat::finish::reduce;
 use subsplat::scene::render::{

@@ -4,8 +4,8 @@ use super::pair::folder_of;
 use anyhow::{Context, Result, bail, ensure};
 use glam::{Mat4, Quat, Vec3};
 use std::path::Path;
-use subsplat::files::protocol::{Views, load_protocol};
-use subsplat::files::scene::Scene;
+use subsplat::files::poses::protocol::{Views, load_protocol};
+use subsplat::files::poses::scene::Scene;
 use subsplat_kernels::camera::Camera;
 
 fn stem(file: &str) -> String {

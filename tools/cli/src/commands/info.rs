@@ -5,9 +5,9 @@ use crate::report::Answer;
 use anyhow::{Context, Result, bail};
 use serde_json::{Value, json};
 use std::path::Path;
-use subsplat::files::image::probe;
-use subsplat::files::photograph::probe_photograph;
-use subsplat::files::scene::{Scene, load_scene};
+use subsplat::files::photos::image::probe;
+use subsplat::files::photos::photograph::probe_photograph;
+use subsplat::files::poses::scene::{Scene, load_scene};
 use subsplat::files::{SplatFormat, SplatInfo, splat_info};
 use subsplat::network::config::Config;
 use subsplat::network::model::weights::Weights;
@@ -142,7 +142,7 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
         scene.points.as_ref().map_or(0, Vec::len)
     ));
     scene.warnings.iter().for_each(|w| answer.line(format!("  warning: {w}")));
-    let frame = |(i, f): (usize, &subsplat::files::scene::Frame)| {
+    let frame = |(i, f): (usize, &subsplat::files::poses::scene::Frame)| {
         let k = f.camera.intrinsics();
         let p = f.camera.position();
         answer.line(format!(

@@ -8,10 +8,10 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use subsplat::EstimatedScene;
 use subsplat::cameras::estimation::Confidence;
-use subsplat::files::cameras_json::save_cameras_and_points;
-use subsplat::files::cameras_json::{CameraFile, NamedCamera};
-use subsplat::files::colmap::{SparsePoint, save_colmap};
-use subsplat::files::scene::Units;
+use subsplat::files::poses::cameras_json::save_cameras_and_points;
+use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera};
+use subsplat::files::poses::colmap::{SparsePoint, save_colmap};
+use subsplat::files::poses::scene::Units;
 use subsplat_kernels::camera::Camera;
 
 /// Runs the command.

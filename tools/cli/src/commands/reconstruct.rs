@@ -8,7 +8,7 @@ use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::borrow::Borrow;
 use subsplat::cameras::check::{PairReport, Verdict};
-use subsplat::files::scene::Scene;
+use subsplat::files::poses::scene::Scene;
 use subsplat::finish::FitReport;
 use subsplat::finish::RefineReport;
 use subsplat::network::config::Config;
@@ -269,8 +269,8 @@ pub fn report(reports: &[PairReport]) -> Vec<Value> {
 mod tests {
     use super::*;
     use glam::Mat4;
-    use subsplat::files::image::Rgb;
     use subsplat::reconstruct::inputs::crop::{CropOptions, crop};
+    use subsplat::scene::pictures::Rgb;
     use subsplat_kernels::camera::{Camera, Intrinsics};
 
     #[test]

@@ -12,9 +12,9 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use subsplat::files::image::Rgb;
 use subsplat::image::ExtendedColorType::Rgb8;
 use subsplat::image::codecs::webp::WebPEncoder;
+use subsplat::scene::pictures::Rgb;
 
 /// Largest side of a GIF, whose header has 16 bits for it, and of a frame of WebP, 24 bits of
 /// which its lossless encoder has 14.

@@ -19,7 +19,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::ExitCode;
 use subsplat::files as io;
-use subsplat::files::tensors::{TensorSpec, write_tensors};
+use subsplat::files::weights::tensors::{TensorSpec, write_tensors};
 use subsplat::network::config::Config;
 
 /// Names that are printed of each list; `--json` has all of them.

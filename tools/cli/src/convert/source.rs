@@ -10,8 +10,8 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use subsplat::files as io;
-use subsplat::files::tensors::{TensorFile, TensorSpec};
-use subsplat::files::torch::{Form, TensorRef, TorchDtype, TorchFile, Value};
+use subsplat::files::weights::tensors::{TensorFile, TensorSpec};
+use subsplat::files::weights::torch::{Form, TensorRef, TorchDtype, TorchFile, Value};
 use subsplat::network::config::Config;
 
 /// Keys of the state dict inside a checkpoint: Lightning's and UniMatch's.

@@ -10,13 +10,14 @@ use program::{Called, SIDE, call_in, call_with, files, named, workplace};
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::Path;
-use subsplat::files::cameras_json::{CameraFile, save_cameras_json};
-use subsplat::files::image::{Rgb, load, save_png};
-use subsplat::files::scene::{Frame, Units, load_scene};
+use subsplat::files::photos::image::{load, save_png};
+use subsplat::files::poses::cameras_json::{CameraFile, save_cameras_json};
+use subsplat::files::poses::scene::{Frame, Units, load_scene};
 use subsplat::network::config::{Config, Preset, SpgrHead};
 use subsplat::network::model::subsplat::SubSplat;
 use subsplat::network::model::weights::{Weights, save};
 use subsplat::scene::metrics::psnr;
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// A quick reconstruction: 64 px input, 128 px target, all frames named.

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 use subsplat::Backend;
-use subsplat::files::tensors::{TensorFile, TensorSpec, write_tensors};
+use subsplat::files::weights::tensors::{TensorFile, TensorSpec, write_tensors};
 use subsplat::network::config::{Backbone, Config, Preset, SpgrHead};
 use subsplat::network::model::subsplat::SubSplat;
 use subsplat::network::model::weights::{Weights, read_tensors, save};

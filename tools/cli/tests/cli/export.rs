@@ -2,7 +2,7 @@
 
 use crate::program::{call_in, call_with, workplace};
 use std::path::Path;
-use subsplat::files::image::load;
+use subsplat::files::photos::image::load;
 use subsplat::files::{SplatFormat, load_splats, parse_splats};
 use subsplat::scene::metrics::psnr;
 use subsplat::scene::splats::Splats;

@@ -2,8 +2,8 @@
 
 use crate::program::{call_in, call_with, workplace};
 use std::path::Path;
-use subsplat::files::cameras_json::load_cameras_json;
-use subsplat::files::image::load;
+use subsplat::files::photos::image::load;
+use subsplat::files::poses::cameras_json::load_cameras_json;
 use subsplat::image::AnimationDecoder;
 use subsplat::image::codecs::webp::WebPDecoder;
 use subsplat_test_support::one_splat::save_one_splat;

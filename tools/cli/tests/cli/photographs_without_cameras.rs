@@ -4,7 +4,7 @@ use crate::program::{call_in, call_with};
 use std::fs;
 use std::path::{Path, PathBuf};
 use subsplat::Camera;
-use subsplat::files::scene::load_scene;
+use subsplat::files::poses::scene::load_scene;
 
 /// The example's folder, whose two inputs have known cameras.
 fn room() -> PathBuf {

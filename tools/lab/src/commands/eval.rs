@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
-use subsplat::files::image::save_png;
+use subsplat::files::photos::image::save_png;
 use subsplat::files::write_atomic;
 use subsplat::reconstruct::inputs::crop::{CropRule, LrFrom};
 use subsplat::reconstruct::{DepthRange, Poses, Reconstructor, is_mvsplat};

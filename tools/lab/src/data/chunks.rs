@@ -16,9 +16,10 @@ use glam::{DMat4, DVec4, Mat4};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use subsplat::files::image::{Rgb, parse_picture};
-use subsplat::files::torch::{TensorRef, TorchDtype, TorchFile, Value};
+use subsplat::files::photos::image::parse_picture;
+use subsplat::files::weights::torch::{TensorRef, TorchDtype, TorchFile, Value};
 use subsplat::files::{Error, Result, read};
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::{Camera, CameraError, Intrinsics};
 
 /// Number of columns of `cameras`.

@@ -19,11 +19,11 @@ use glam::{Mat4, Vec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use subsplat::files::image::Rgb;
-use subsplat::files::scene::{Scene, is_scene, load_scene};
+use subsplat::files::poses::scene::{Scene, is_scene, load_scene};
 use subsplat::files::{Error, Result};
 use subsplat::reconstruct::inputs::crop::{CropOptions, crop};
 use subsplat::reconstruct::{DepthBounds, DepthRange};
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar, Size};
 
 /// Widest field of view of an example, degrees (pixelSplat's `max_fov`).

@@ -1,9 +1,9 @@
 //! Effects of cameras and files on pictures: blur, exposure, JPEG compression.
 
 use rayon::prelude::*;
-use subsplat::files::image::Rgb;
 use subsplat::image::codecs::jpeg::JpegEncoder;
 use subsplat::image::{ExtendedColorType, ImageFormat};
+use subsplat::scene::pictures::Rgb;
 
 /// Applies a Gaussian blur of σ `sigma` px to `[H, W, 3]`, 3σ wide, with the border repeated.
 pub(crate) fn blurred(rgb: &[f32], width: usize, sigma: f32) -> Vec<f32> {

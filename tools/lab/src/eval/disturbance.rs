@@ -3,10 +3,10 @@
 use super::preparation::photos;
 use crate::data::photographic::{blurred, compress, expose};
 use glam::{Mat4, Quat, Vec3};
-use subsplat::files::image::Rgb;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::reconstruct::stages::check_pairs;
 use subsplat::reconstruct::{DepthBounds, Result};
+use subsplat::scene::pictures::Rgb;
 
 /// A disturbance of the inputs of every case. Targets stay.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

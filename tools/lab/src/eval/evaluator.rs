@@ -8,11 +8,11 @@ use super::{
 };
 use crate::lpips::Lpips;
 use std::path::Path;
-use subsplat::files::image::Rgb;
 use subsplat::reconstruct::inputs::crop::{CropOptions, CropRule, Cropped, LrFrom};
 use subsplat::reconstruct::{
     Density, DepthBounds, DepthRange, Error, Photo, Reconstructor, Result, TargetSize,
 };
+use subsplat::scene::pictures::Rgb;
 use subsplat::scene::splats::SplatStatistics;
 use subsplat_kernels::camera::{Camera, Size};
 use subsplat_kernels::clock::Instant;

@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
-use subsplat::files::image::{Rgb, load};
+use subsplat::files::photos::image::load;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::reconstruct::{Error, Result};
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::Camera;
 
 /// A method that gives a picture of a target view.

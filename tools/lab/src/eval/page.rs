@@ -5,8 +5,9 @@ use super::{CaseResult, InputReport, Score, Scores};
 use std::fmt::Write;
 use std::path::Path;
 use subsplat::files::Result;
-use subsplat::files::image::{Rgb, png_bytes};
+use subsplat::files::photos::image::png_bytes;
 use subsplat::scene::metrics::mean_gradient;
+use subsplat::scene::pictures::Rgb;
 use subsplat_cli::report::escaped;
 
 /// Side of the windows, target px.

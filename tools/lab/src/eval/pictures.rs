@@ -4,7 +4,6 @@ use super::Method;
 use super::evaluator::{Crops, Options};
 use super::methods::{enlarged, mean, nearest};
 use std::ops::ControlFlow;
-use subsplat::files::image::Rgb;
 use subsplat::finish::{FitOptions, Refiner};
 use subsplat::network::config::LowpassRef;
 use subsplat::network::model::scene_encoding::SceneEncoding;
@@ -16,6 +15,7 @@ use subsplat::reconstruct::stages::{
     SceneChildren, add_detail, counts_of, fit_to_inputs, refine_on_inputs,
 };
 use subsplat::reconstruct::{Density, DepthBounds, Error, Reconstructor, Refine, Result};
+use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{Renderer, render_with};
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::Camera;

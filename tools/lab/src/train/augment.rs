@@ -10,7 +10,7 @@ use crate::data::photographic::{blurred, compress};
 use glam::{Mat4, Quat, Vec3};
 use half::f16;
 use serde::{Deserialize, Serialize};
-use subsplat::files::image::Rgb;
+use subsplat::scene::pictures::Rgb;
 
 /// Transformations of an example. The defaults are those of the training recipe.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -9,7 +9,7 @@ use safetensors::Dtype;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use subsplat::files::tensors::{TensorSpec, write_tensors};
+use subsplat::files::weights::tensors::{TensorSpec, write_tensors};
 use subsplat::network::model::weights::read_tensors;
 
 /// Metadata key of [`Progress`].

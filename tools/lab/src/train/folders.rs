@@ -7,8 +7,8 @@ use serde_json::json;
 use std::io::Write;
 use std::path::Path;
 use subsplat::files as io;
-use subsplat::files::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::files::image::save_png;
+use subsplat::files::photos::image::save_png;
+use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 
 /// Writes an example to the folder `place`: its pictures, context views first, cameras.json, and a
 /// protocol.json of one test. The protocol is written last.

@@ -6,8 +6,8 @@ use super::source::{Example, InputTargets};
 use crate::data::dataset::Posed;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use subsplat::files::protocol::{Views, load_protocol};
-use subsplat::files::scene::{Scene, load_scene};
+use subsplat::files::poses::protocol::{Views, load_protocol};
+use subsplat::files::poses::scene::{Scene, load_scene};
 use subsplat::reconstruct::inputs::crop::{CropOptions, crop};
 use subsplat::reconstruct::{DepthBounds, DepthRange};
 

@@ -25,7 +25,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use subsplat::files as io;
-use subsplat::files::tensors::{TensorSpec, write_tensors};
+use subsplat::files::weights::tensors::{TensorSpec, write_tensors};
 use subsplat_kernels::clock::Instant;
 
 /// Folder of the exchanged files, inside the training's.

@@ -9,8 +9,8 @@ use half::f16;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
-use subsplat::files::image::Rgb;
 use subsplat::reconstruct::inputs::pair::quantile;
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::NearFar;
 use subsplat_kernels::layout::random::{GOLDEN, mix};
 

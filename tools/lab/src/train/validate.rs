@@ -11,11 +11,12 @@ use candle_core::Tensor;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use subsplat::files::image::{Rgb, save_png};
+use subsplat::files::photos::image::save_png;
 use subsplat::network::config::{Backbone, Config};
 use subsplat::network::model::subsplat::SubSplat;
 use subsplat::network::model::weights::{SUBSPLAT_PREFIX, Weights};
 use subsplat::scene::metrics::{psnr, ssim};
+use subsplat::scene::pictures::Rgb;
 use subsplat_cli::lettering;
 
 /// Key mixed into the data's seed, which gives other scenes than those of the training.

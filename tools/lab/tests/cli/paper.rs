@@ -6,7 +6,7 @@ use program::{call_in, files, workplace};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::Path;
-use subsplat::files::image::load;
+use subsplat::files::photos::image::load;
 
 const TINY: &str = "--limit 1 --steps 1 --seeds 1 --input-size 32 --frames 3";
 const COLUMNS: usize = 19;

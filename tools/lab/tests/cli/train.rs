@@ -5,8 +5,8 @@ use subsplat_test_support::made_up;
 
 use std::path::Path;
 use std::time::Duration;
-use subsplat::files::cameras_json::{CameraFile, save_cameras_json};
-use subsplat::files::scene::Units;
+use subsplat::files::poses::cameras_json::{CameraFile, save_cameras_json};
+use subsplat::files::poses::scene::Units;
 use subsplat_kernels::camera::NearFar;
 use subsplat_lab::train::TrainConfig;
 use subsplat_lab::train::checkpoint;

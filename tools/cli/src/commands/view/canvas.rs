@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result, anyhow, ensure};
 use std::sync::{Arc, Mutex, PoisonError};
-use subsplat::files::image::Rgb;
+use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::gpu::{
     DeviceChoice, Gpu, Rasterizer, Scene, features_of, find_for, instance, limits_of, wgpu,

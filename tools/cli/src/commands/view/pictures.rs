@@ -4,7 +4,8 @@ use anyhow::{Context, Result, bail};
 use std::fs::OpenOptions;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use subsplat::files::image::{Rgb, save_png};
+use subsplat::files::photos::image::save_png;
+use subsplat::scene::pictures::Rgb;
 
 /// Largest number of pictures of one name in a folder.
 const NUMBER_MAX: usize = 9999;
@@ -49,7 +50,7 @@ mod tests {
         assert_eq!(name(save_next(&deep, "s", &picture).unwrap()), "s-0003.png");
         assert_eq!(name(save_next(&deep, "x/y", &picture).unwrap()), "x_y-0001.png");
         assert_eq!(std::fs::read(deep.join("s-0002.png")).unwrap(), b"mine");
-        let whole = subsplat::files::image::load(deep.join("s-0003.png")).unwrap();
+        let whole = subsplat::files::photos::image::load(deep.join("s-0003.png")).unwrap();
         assert_eq!((whole.width, whole.height), (2, 1));
         // A picture that cannot be written leaves no file.
         let none = Rgb { width: 2, height: 1, data: Vec::new() };

@@ -23,7 +23,7 @@ use sheet::Scene;
 use std::io::Write;
 use std::path::Path;
 use std::process::Command;
-use subsplat::files::image::save_png;
+use subsplat::files::photos::image::save_png;
 use subsplat::files::write_atomic;
 use subsplat::reconstruct::Reconstructor;
 use subsplat_cli::commands::environment;

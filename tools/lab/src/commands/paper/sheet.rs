@@ -1,8 +1,8 @@
 //! Pictures of a figure: the methods side by side, whole and as a window of the busiest part.
 
 use crate::eval::busiest;
-use subsplat::files::image::Rgb;
-use subsplat::files::resize::{Filter, resize};
+use subsplat::files::photos::resize::{Filter, resize};
+use subsplat::scene::pictures::Rgb;
 use subsplat_cli::lettering;
 
 /// Side of a cell, px.

@@ -1,0 +1,155 @@
+//! Photographs without a pose file, from a phone or a camera.
+//!
+//! A [`Photograph`] is upright: its EXIF orientation is applied. `image.rs` keeps the stored
+//! pixels instead, to which pose files refer. The EXIF block also gives the focal length
+//! (`exif.rs`).
+//!
+//! ICC profiles are applied to both kinds of pictures: a wrong colour is wrong for every reader.
+
+use super::decode::{self, Header, decode};
+use super::exif::{ExifCamera, ExifReport, parse_exif};
+use super::image::{LoadOptions, Probe};
+use crate::files::poses::assemble::list_images;
+use crate::files::{Error, Result, read};
+use crate::scene::pictures::Rgb;
+use image::metadata::Orientation;
+use image::{DynamicImage, RgbImage};
+use std::path::{Path, PathBuf};
+use subsplat_kernels::camera::Intrinsics;
+
+/// A photograph with upright pixels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Photograph {
+    /// Upright pixels, sRGB.
+    pub image: Rgb,
+    /// The EXIF orientation that was applied, 2 to 8; `None` if the stored pixels are upright.
+    pub orientation: Option<u8>,
+    /// The camera of the EXIF block. Its focal length is in px of [`Photograph::image`].
+    pub camera: ExifCamera,
+    /// Warnings for the user, one line each, with the file's path.
+    pub warnings: Vec<String>,
+}
+
+/// Header of a photograph: everything but the pixels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PhotographHeader {
+    /// Width after the orientation is applied, px.
+    pub width: usize,
+    /// Height after the orientation is applied, px.
+    pub height: usize,
+    /// The EXIF orientation that [`load_photograph`] applies, 2 to 8.
+    pub orientation: Option<u8>,
+    /// The camera of the EXIF block. Its focal length is in px of `width` × `height`.
+    pub camera: ExifCamera,
+    /// Warnings for the user, one line each, with the file's path.
+    pub warnings: Vec<String>,
+}
+
+/// Makes intrinsics with square pixels and the principal point in the middle.
+fn intrinsics(camera: &ExifCamera, width: usize, height: usize) -> Option<Intrinsics> {
+    let f = camera.focal?.px as f32;
+    let (cx, cy) = (0.5 * width as f32, 0.5 * height as f32);
+    Some(Intrinsics { fx: f, fy: f, cx, cy, width, height })
+}
+
+impl Photograph {
+    /// Upright sRGB pixels (an [`Rgb`] or an `image::RgbImage`) of a photograph in memory, about whose
+    /// camera nothing is known.
+    pub fn from_pixels(image: impl Into<Rgb>) -> Self {
+        let image = image.into();
+        let camera = ExifCamera::default();
+        Self { image, orientation: None, camera, warnings: Vec::new() }
+    }
+
+    /// Returns intrinsics of EXIF's focal length, px, with the principal point in the middle;
+    /// `None` if EXIF does not determine it.
+    pub fn intrinsics(&self) -> Option<Intrinsics> {
+        intrinsics(&self.camera, self.image.width, self.image.height)
+    }
+}
+
+impl PhotographHeader {
+    /// Returns the intrinsics as [`Photograph::intrinsics`] does.
+    pub fn intrinsics(&self) -> Option<Intrinsics> {
+        intrinsics(&self.camera, self.width, self.height)
+    }
+}
+
+/// Lists the photographs of a folder, by name with numbers in numeric order; without any, those of
+/// its folder `images`.
+pub fn list_photographs(folder: impl AsRef<Path>) -> Vec<PathBuf> {
+    let folder = folder.as_ref();
+    let own = list_images(folder);
+    if own.is_empty() { list_images(&folder.join("images")) } else { own }
+}
+
+/// Reads the header of a photograph.
+///
+/// # Errors
+/// Those of [`super::image::probe`]; a DNG raw file.
+pub fn probe_photograph(path: impl AsRef<Path>) -> Result<PhotographHeader> {
+    let path = path.as_ref();
+    let Header { probe, exif } = decode::header(path)?;
+    let orientation = probe.orientation;
+    let Probe { width, height, .. } = probe.upright();
+    let ExifReport { camera, warnings, .. } = report(exif.as_deref(), width, height, path)?;
+    Ok(PhotographHeader { width, height, orientation, camera, warnings })
+}
+
+/// Decodes a photograph and turns it upright.
+///
+/// # Errors
+/// Those of [`super::image::load_with`]; a DNG raw file.
+pub fn load_photograph(path: impl AsRef<Path>, options: &LoadOptions) -> Result<Photograph> {
+    let path = path.as_ref();
+    parse_photograph(&read(path)?, options, path)
+}
+
+/// Decodes bytes in memory as [`load_photograph`] does; `path` is for messages.
+///
+/// # Errors
+/// As [`load_photograph`].
+pub fn parse_photograph(
+    bytes: &[u8],
+    options: &LoadOptions,
+    path: impl AsRef<Path>,
+) -> Result<Photograph> {
+    decode_upright(bytes, options, path.as_ref())
+}
+
+fn decode_upright(bytes: &[u8], options: &LoadOptions, path: &Path) -> Result<Photograph> {
+    let decoded = decode(bytes, options, path)?;
+    let Rgb { width, height, .. } = decoded.picture;
+    let report = report(decoded.exif.as_deref(), width, height, path)?;
+    let image = upright(decoded.picture, decoded.orientation)?;
+    let orientation = Some(decoded.orientation.to_exif()).filter(|o| *o > 1);
+    let mut warnings = decoded.warnings;
+    warnings.extend(report.warnings);
+    Ok(Photograph { image, orientation, camera: report.camera, warnings })
+}
+
+/// Applies an EXIF orientation.
+fn upright(picture: Rgb, orientation: Orientation) -> Result<Rgb> {
+    if orientation == Orientation::NoTransforms {
+        return Ok(picture);
+    }
+    let mut pixels = DynamicImage::ImageRgb8(RgbImage::try_from(picture)?);
+    pixels.apply_orientation(orientation);
+    Ok(pixels.into_rgb8().into())
+}
+
+/// Reads the EXIF block and adds the path to its warnings.
+fn report(block: Option<&[u8]>, width: usize, height: usize, path: &Path) -> Result<ExifReport> {
+    let mut report = block.map(|b| parse_exif(b, width, height)).unwrap_or_default();
+    if report.raw {
+        return Err(Error::format(
+            path,
+            "a developed photograph (JPEG, HEIC, PNG, TIFF)",
+            "a DNG raw file (develop it to JPEG first)",
+        ));
+    }
+    for warning in &mut report.warnings {
+        *warning = format!("{}: {warning}", path.display());
+    }
+    Ok(report)
+}

@@ -1,0 +1,385 @@
+//! Lens distortion: the models of pose files, and their removal.
+//!
+//! A point (x, y) at z = 1 in camera coordinates projects to fx·x' + cx, fy·y' + cy. With
+//! r² = x² + y², (x', y') is (OpenCV's and COLMAP's formulas)
+//!
+//! * Brown: x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶)
+//!   + 2 p1 x y + p2 (r² + 2x²), and y' alike with p1, p2 exchanged;
+//! * Fisheye: (x', y') = (x, y)·θ_d/r, θ = atan r, θ_d = θ(1 + k1 θ² + … + k4 θ⁸).
+//!
+//! The undistorted picture has the stored size and principal point. Both focal lengths are
+//! multiplied by the smallest factor for which every pixel lies inside the photograph: the
+//! picture has no black border and keeps its aspect. Sampling is bicubic (a = −½), clamped
+//! at the photograph's edge.
+
+use crate::scene::pictures::Rgb;
+use glam::{DVec2, Vec2};
+use rayon::prelude::*;
+use subsplat_kernels::camera::Intrinsics;
+
+/// A model of lens distortion.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Distortion {
+    /// A pinhole.
+    #[default]
+    None,
+    /// Radial (rational) and tangential: COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and
+    /// FULL_OPENCV.
+    Brown {
+        /// k1, k2, k3 of the numerator, k4, k5, k6 of the denominator.
+        k: [f64; 6],
+        /// p1, p2.
+        p: [f64; 2],
+    },
+    /// Equidistant with a polynomial: COLMAP's OPENCV_FISHEYE.
+    Fisheye {
+        /// k1 to k4.
+        k: [f64; 4],
+    },
+}
+
+impl Distortion {
+    /// Makes [`Distortion::Brown`], or `None` if every coefficient is zero.
+    pub fn brown(k: [f64; 6], p: [f64; 2]) -> Self {
+        if k == [0.0; 6] && p == [0.0; 2] { Self::None } else { Self::Brown { k, p } }
+    }
+
+    /// Makes [`Distortion::Fisheye`], with zero coefficients too.
+    pub fn fisheye(k: [f64; 4]) -> Self {
+        Self::Fisheye { k }
+    }
+
+    /// Checks that the coefficients are finite; an error lists them.
+    pub(in crate::files) fn check(&self) -> Result<(), String> {
+        let finite = match self {
+            Self::None => true,
+            Self::Brown { k, p } => k.iter().chain(p).all(|v| v.is_finite()),
+            Self::Fisheye { k } => k.iter().all(|v| v.is_finite()),
+        };
+        if finite { Ok(()) } else { Err(format!("{self:?}")) }
+    }
+
+    /// Maps a ray (x, y, 1) to its distorted position on the plane z = 1.
+    pub fn distort(&self, ray: Vec2) -> Vec2 {
+        self.distort_f64(ray.as_dvec2()).as_vec2()
+    }
+
+    fn distort_f64(&self, ray: DVec2) -> DVec2 {
+        let DVec2 { x, y } = ray;
+        let r2 = ray.length_squared();
+        match *self {
+            Self::None => ray,
+            Self::Brown { p, .. } => {
+                let xy = 2.0 * x * y;
+                let tangential = DVec2::new(
+                    p[0] * xy + p[1] * (r2 + 2.0 * x * x),
+                    p[1] * xy + p[0] * (r2 + 2.0 * y * y),
+                );
+                ray * self.radial(r2) + tangential
+            }
+            Self::Fisheye { .. } => ray * self.radial(r2),
+        }
+    }
+
+    /// Returns r'/r of the radial part.
+    fn radial(&self, r2: f64) -> f64 {
+        match *self {
+            Self::None => 1.0,
+            Self::Brown { k, .. } => {
+                let top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]));
+                let bottom = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]));
+                top / bottom
+            }
+            Self::Fisheye { k } => {
+                let r = r2.sqrt();
+                if r < 1e-9 {
+                    return 1.0;
+                }
+                let theta = r.atan();
+                let t2 = theta * theta;
+                theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))) / r
+            }
+        }
+    }
+
+    /// Returns the largest radius at z = 1, up to `limit`, below which r' grows. Beyond it the
+    /// polynomial folds back and no longer describes the lens.
+    fn monotone_radius(&self, limit: f64) -> f64 {
+        const STEPS: usize = 512;
+        let mut last = 0.0;
+        for i in 1..=STEPS {
+            let r = limit * i as f64 / STEPS as f64;
+            let distorted = r * self.radial(r * r);
+            if distorted.is_nan() || distorted <= last {
+                return limit * (i - 1) as f64 / STEPS as f64;
+            }
+            last = distorted;
+        }
+        limit
+    }
+}
+
+/// Range of the focal factor. Below ½, the middle would have a quarter of its pixels; above
+/// 4, a sixteenth of the picture would remain.
+const FOCAL_FACTORS: [f64; 2] = [0.5, 4.0];
+
+/// Computes the pinhole of the undistorted picture (see the module's documentation).
+///
+/// # Errors
+/// The distortion, where four times the focal length still leaves a black border.
+pub fn pinhole(k: &Intrinsics, distortion: &Distortion) -> Result<Intrinsics, String> {
+    if *distortion == Distortion::None {
+        return Ok(*k);
+    }
+    let [mut low, mut high] = FOCAL_FACTORS;
+    let corner = border(k).map(|px| ray(k, px).length()).fold(0.0, f64::max);
+    let fold = distortion.monotone_radius(corner / low);
+    let covered = |factor: f64| {
+        border(k).all(|px| {
+            let r = ray(k, px) / factor;
+            let seen = distortion.distort_f64(r);
+            let u = f64::from(k.fx) * seen.x + f64::from(k.cx);
+            let v = f64::from(k.fy) * seen.y + f64::from(k.cy);
+            // A NaN fails every comparison.
+            r.length() <= fold
+                && (0.0..=k.width as f64).contains(&u)
+                && (0.0..=k.height as f64).contains(&v)
+        })
+    };
+    if !covered(high) {
+        return Err(format!("{distortion:?}, which leaves no rectangle inside the picture"));
+    }
+    if covered(low) {
+        high = low;
+    }
+    // 30 bisections: a millionth of a pixel.
+    for _ in 0..30 {
+        let middle = 0.5 * (low + high);
+        if covered(middle) {
+            high = middle;
+        } else {
+            low = middle;
+        }
+    }
+    Ok(Intrinsics {
+        fx: (f64::from(k.fx) * high) as f32,
+        fy: (f64::from(k.fy) * high) as f32,
+        ..*k
+    })
+}
+
+/// Iterates over the centres of the pixels along the picture's edge.
+fn border(k: &Intrinsics) -> impl Iterator<Item = DVec2> {
+    let (w, h) = (k.width, k.height);
+    let rows = (0..w).flat_map(move |x| [(x, 0), (x, h - 1)]);
+    let columns = (0..h).flat_map(move |y| [(0, y), (w - 1, y)]);
+    rows.chain(columns).map(|(x, y)| DVec2::new(x as f64 + 0.5, y as f64 + 0.5))
+}
+
+fn ray(k: &Intrinsics, px: DVec2) -> DVec2 {
+    DVec2::new(
+        (px.x - f64::from(k.cx)) / f64::from(k.fx),
+        (px.y - f64::from(k.cy)) / f64::from(k.fy),
+    )
+}
+
+/// Resamples the photograph of a lens with `distortion` and intrinsics `from` to the pinhole
+/// `to`.
+pub fn undistort(photo: &Rgb, from: &Intrinsics, distortion: &Distortion, to: &Intrinsics) -> Rgb {
+    let mut out = Rgb::black(to.width, to.height);
+    if out.data.is_empty() || photo.data.is_empty() {
+        return out;
+    }
+    out.data.par_chunks_mut(3 * to.width).enumerate().for_each(|(y, line)| {
+        for (x, pixel) in line.chunks_exact_mut(3).enumerate() {
+            let r = ray(to, DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
+            let seen = distortion.distort_f64(r);
+            let u = f64::from(from.fx) * seen.x + f64::from(from.cx);
+            let v = f64::from(from.fy) * seen.y + f64::from(from.cy);
+            pixel.copy_from_slice(&sample(photo, u as f32, v as f32));
+        }
+    });
+    out
+}
+
+/// Computes the weights of the neighbours at −1, 0, 1, 2 of a position `t` in [0, 1) (cubic
+/// convolution, a = −½).
+fn cubic(t: f32) -> [f32; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [
+        -0.5 * t + t2 - 0.5 * t3,
+        1.0 - 2.5 * t2 + 1.5 * t3,
+        0.5 * t + 2.0 * t2 - 1.5 * t3,
+        -0.5 * t2 + 0.5 * t3,
+    ]
+}
+
+/// Samples bicubically at pixel position (u, v), clamped at the edge.
+fn sample(photo: &Rgb, u: f32, v: f32) -> [u8; 3] {
+    let (u, v) = (u - 0.5, v - 0.5);
+    let (x0, y0) = (u.floor(), v.floor());
+    let (wx, wy) = (cubic(u - x0), cubic(v - y0));
+    // `as` saturates: any position gives a valid index.
+
+    let at = |i: f32, n: usize| (i.max(0.0) as usize).min(n - 1);
+    let mut sum = [0.0f32; 3];
+    for (j, wy) in wy.into_iter().enumerate() {
+        let row = at(y0 + j as f32 - 1.0, photo.height) * photo.width;
+        for (i, wx) in wx.into_iter().enumerate() {
+            let p = 3 * (row + at(x0 + i as f32 - 1.0, photo.width));
+            for (s, v) in sum.iter_mut().zip(&photo.data[p..p + 3]) {
+                *s += wx * wy * f32::from(*v);
+            }
+        }
+    }
+    sum.map(|s| (s + 0.5) as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const K: Intrinsics =
+        Intrinsics { fx: 200.0, fy: 210.0, cx: 155.0, cy: 122.0, width: 320, height: 240 };
+
+    fn lenses() -> Vec<Distortion> {
+        vec![
+            Distortion::brown([-0.2, 0.05, 0.0, 0.0, 0.0, 0.0], [0.001, -0.002]),
+            Distortion::brown([0.15, 0.0, 0.01, 0.0, 0.0, 0.0], [0.0, 0.0]),
+            Distortion::brown([0.3, 0.1, 0.0, 0.5, 0.05, 0.0], [0.0, 0.0]),
+            Distortion::fisheye([0.02, -0.01, 0.0, 0.0]),
+        ]
+    }
+
+    /// Values by tools/make_distortion_golden.py (OpenCV 5.0.0).
+    #[test]
+    fn distort_is_opencvs() {
+        let rays = [(0.3, -0.2), (-0.5, 0.4), (0.7, 0.1)];
+        let table = [
+            (
+                Distortion::brown(
+                    [0.0578421, -0.0805099, 0.0, 0.0, 0.0, 0.0],
+                    [-0.000980296, 0.00015575],
+                ),
+                [
+                    (0.302013575, -0.201456323),
+                    (-0.504556923, 0.403294703),
+                    (0.706248771, 0.100391409),
+                ],
+            ),
+            (
+                Distortion::brown([-0.2, 0.05, 0.03, 0.0, 0.0, 0.0], [0.01, -0.02]),
+                [(0.285073273, -0.190482182), (-0.486436315, 0.386689052), (0.613175, 0.094025)],
+            ),
+            (
+                Distortion::brown([0.3, 0.1, -0.02, 0.5, 0.05, 0.01], [0.003, 0.004]),
+                [
+                    (0.293781297, -0.195117531),
+                    (-0.466399885, 0.375661908),
+                    (0.655795984, 0.094899426),
+                ],
+            ),
+            (
+                Distortion::fisheye([0.0; 4]),
+                [
+                    (0.287928451, -0.1919523),
+                    (-0.444731961, 0.355785569),
+                    (0.609293826, 0.087041975),
+                ],
+            ),
+            (
+                Distortion::fisheye([0.02, -0.01, 0.005, -0.002]),
+                [
+                    (0.288579096, -0.192386064),
+                    (-0.44721523, 0.357772184),
+                    (0.613176193, 0.087596599),
+                ],
+            ),
+        ];
+        for (lens, seen) in table {
+            for (ray, want) in rays.into_iter().zip(seen) {
+                let got = lens.distort_f64(ray.into());
+                assert!((got - DVec2::from(want)).length() < 1e-8, "{lens:?} {ray:?}: {got}");
+            }
+            assert_eq!(lens.distort(Vec2::ZERO).x, lens.distort_f64(DVec2::ZERO).x as f32);
+        }
+    }
+
+    #[test]
+    fn the_new_pinhole_touches_the_border_and_stays_inside() {
+        for lens in lenses() {
+            let new = pinhole(&K, &lens).unwrap();
+            let (mut inside, mut closest) = (true, f64::MAX);
+            for px in border(&new) {
+                let d = lens.distort_f64(ray(&new, px));
+                let u = f64::from(K.fx) * d.x + f64::from(K.cx);
+                let v = f64::from(K.fy) * d.y + f64::from(K.cy);
+                let edge = u.min(v).min(320.0 - u).min(240.0 - v);
+                inside &= edge > -1e-3;
+                closest = closest.min(edge);
+            }
+            assert!(inside && closest < 1e-2, "{lens:?} {new:?} {closest}");
+            assert!((new.fx / K.fx - new.fy / K.fy).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn barrel_is_widened_and_pincushion_zoomed() {
+        assert!(
+            pinhole(&K, &Distortion::brown([-0.2, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2])).unwrap().fx
+                < K.fx
+        );
+        assert!(
+            pinhole(&K, &Distortion::brown([0.2, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2])).unwrap().fx
+                > K.fx
+        );
+    }
+
+    #[test]
+    fn a_grid_becomes_straight() {
+        // The photograph shows u of the ray in red and v in green, bent by the lens.
+        for lens in lenses() {
+            let new = pinhole(&K, &lens).unwrap();
+            // Inverse of `distort` by fixed-point iteration, for the test alone.
+            let straight = |px: DVec2| {
+                let seen = ray(&K, px);
+                let mut r = seen;
+                for _ in 0..200 {
+                    r += 0.7 * (seen - lens.distort_f64(r));
+                }
+                r
+            };
+            let mut photo = Rgb::black(K.width, K.height);
+            let shade = |v: f64| (128.0 + 100.0 * v).clamp(0.0, 255.0).round() as u8;
+            for y in 0..K.height {
+                for x in 0..K.width {
+                    let r = straight(DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
+                    let p = 3 * (y * K.width + x);
+                    photo.data[p] = shade(r.x);
+                    photo.data[p + 1] = shade(r.y);
+                }
+            }
+            let out = undistort(&photo, &K, &lens, &new);
+            for (i, pixel) in out.data.chunks_exact(3).enumerate() {
+                let at = DVec2::new((i % K.width) as f64 + 0.5, (i / K.width) as f64 + 0.5);
+                let r = ray(&new, at);
+                for (got, want) in [(pixel[0], shade(r.x)), (pixel[1], shade(r.y))] {
+                    assert!(got.abs_diff(want) <= 2, "{lens:?} at {at}: {got} not {want}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_lens_that_folds_is_refused_or_cut_before_the_fold() {
+        // r' = r(1 − 2r²) turns back at r = 0.41; the picture's corner is at 0.97.
+        let lens = Distortion::brown([-2.0, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]);
+        let new = pinhole(&K, &lens).unwrap();
+        let corner = border(&new).map(|px| ray(&new, px).length()).fold(0.0, f64::max);
+        assert!(corner <= 0.41, "{corner}");
+        let lens = Distortion::brown([-200.0, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]);
+        assert!(pinhole(&K, &lens).is_err());
+        let lens = Distortion::brown([f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]);
+        assert!(pinhole(&K, &lens).is_err());
+    }
+}

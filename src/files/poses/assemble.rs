@@ -1,0 +1,397 @@
+//! Common parts of the pose readers: search for pictures, reading of their headers, and
+//! conversion of a file's entries to checked [`Frame`]s.
+
+use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
+use crate::files::photos::image::{Probe, probe};
+use crate::files::photos::undistort::Distortion;
+use crate::files::{Error, Result};
+use glam::{DMat3, DMat4};
+use rayon::prelude::*;
+use std::path::{Path, PathBuf};
+use subsplat_kernels::camera::{Camera, CameraError, Intrinsics};
+
+/// Intrinsics in the form of a pose file.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Lens {
+    /// fx, fy, cx, cy in pixels of the pose file's size.
+    Pixels([f64; 4]),
+    /// fx, fy, cx, cy divided by width and height of the picture.
+    Normalised([f64; 4]),
+}
+
+/// A frame before its picture's header is read.
+#[derive(Clone, Debug)]
+pub(super) struct Draft {
+    /// Place in the pose file, in the form of [`Error::at`].
+    pub place: String,
+    /// Path of the picture in the pose file.
+    pub file: String,
+    /// Path of the picture on disk, `None` if there is none.
+    pub image: Option<PathBuf>,
+    /// Pixels to which the intrinsics refer.
+    pub pixels: Pixels,
+    /// Intrinsics.
+    pub lens: Lens,
+    /// Picture size to which the intrinsics belong, if the file has it.
+    pub size: Option<(usize, usize)>,
+    /// OpenCV pose.
+    pub world_from_camera: DMat4,
+    /// See [`Frame`].
+    pub distortion: Distortion,
+    /// See [`Frame`].
+    pub timestamp: Option<i64>,
+    /// See [`Frame`].
+    pub depth: Option<PathBuf>,
+    /// See [`Frame`].
+    pub visible: Vec<u32>,
+}
+
+impl Draft {
+    pub fn new(place: String, file: String, lens: Lens, world_from_camera: DMat4) -> Self {
+        Self {
+            place,
+            file,
+            image: None,
+            pixels: Pixels::Stored,
+            lens,
+            size: None,
+            world_from_camera,
+            distortion: Distortion::None,
+            timestamp: None,
+            depth: None,
+            visible: Vec::new(),
+        }
+    }
+}
+
+/// Extensions tried where a pose file names a picture without one (NeRF's blender
+/// scenes, some nerfstudio exports).
+pub(super) const EXTENSIONS: [&str; 14] = [
+    "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "TIF", "bmp", "BMP", "heic",
+    "HEIC",
+];
+
+/// Searches for a picture below `roots`, with and without `images/` between.
+pub(super) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
+    let name = name.replace('\\', "/");
+    let name = name.trim_start_matches("./");
+    if name.is_empty() {
+        return None;
+    }
+    let places: Vec<PathBuf> =
+        roots.iter().flat_map(|r| [r.join(name), r.join("images").join(name)]).collect();
+    // The last test is `exists`: a folder of the picture's name is an error of the probe,
+    // not a missing picture.
+    let mut candidates = places.iter().filter(|p| p.is_file()).cloned();
+    candidates
+        .next()
+        .or_else(|| places.iter().flat_map(|p| with_extensions(p)).find(|p| p.is_file()))
+        .or_else(|| places.iter().find(|p| p.exists()).cloned())
+}
+
+fn with_extensions(place: &Path) -> impl Iterator<Item = PathBuf> + '_ {
+    EXTENSIONS.iter().map(move |e| {
+        let mut path = place.as_os_str().to_owned();
+        path.push(".");
+        path.push(e);
+        PathBuf::from(path)
+    })
+}
+
+/// A part of a file name, in the order of the fields: a character, or a number that sorts
+/// as `0` among characters, by its length and then by its digits.
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+struct NamePart {
+    first: char,
+    digit_count: usize,
+    digits: String,
+}
+
+/// Makes the sort key of a file name. A run of digits is one number, so that `9.png` comes
+/// before `10.png`.
+fn numeric_key(path: &Path) -> Vec<NamePart> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let (mut key, mut rest) = (Vec::new(), &*name);
+    while let Some(first) = rest.chars().next() {
+        let run = rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len());
+        if run == 0 {
+            key.push(NamePart { first, digit_count: 0, digits: String::new() });
+            rest = &rest[first.len_utf8()..];
+        } else {
+            let digits = rest[..run].trim_start_matches('0').to_owned();
+            key.push(NamePart { first: '0', digit_count: digits.len(), digits });
+            rest = &rest[run..];
+        }
+    }
+    key
+}
+
+/// Lists the pictures of a folder, sorted by name with numbers in numeric order; empty if
+/// there is no such folder.
+pub(in crate::files) fn list_images(folder: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let is_picture = |p: &PathBuf| {
+        let extension = p.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        EXTENSIONS.contains(&extension.as_str())
+    };
+    let mut images: Vec<PathBuf> =
+        entries.filter_map(|e| Some(e.ok()?.path())).filter(is_picture).collect();
+    // The path decides between `01.png` and `1.png`.
+    images.sort_by_cached_key(|p| (numeric_key(p), p.clone()));
+    images
+}
+
+/// A pose after [`orthonormal`].
+pub(super) struct OrthonormalPose {
+    /// The corrected pose.
+    pub pose: DMat4,
+    /// Largest entry of |RᵀR − I| before the correction.
+    pub error: f64,
+}
+
+/// Replaces the rotation by the nearest orthonormal one, to undo rounding in the file. The
+/// pose stays as it is where [`Camera::new`] would refuse it, and where the error is below
+/// the precision of f32.
+pub(super) fn orthonormal(pose: DMat4) -> OrthonormalPose {
+    let error = |r: DMat3| {
+        let gram = r.transpose() * r - DMat3::IDENTITY;
+        gram.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()))
+    };
+    let mut rotation = DMat3::from_mat4(pose);
+    let error = error(rotation);
+    if !(2e-6..=f64::from(Camera::RIGID_TOLERANCE)).contains(&error) {
+        return OrthonormalPose { pose, error };
+    }
+    // Newton's iteration for the polar decomposition converges quadratically; the start is
+    // within 1 %.
+    for _ in 0..6 {
+        rotation = (rotation + rotation.inverse().transpose()) * 0.5;
+    }
+    let column = |v: glam::DVec3| v.extend(0.0);
+    let pose = DMat4::from_cols(
+        column(rotation.x_axis),
+        column(rotation.y_axis),
+        column(rotation.z_axis),
+        pose.w_axis,
+    );
+    OrthonormalPose { pose, error }
+}
+
+/// Intrinsics in pixels of a picture on disk.
+struct StoredIntrinsics {
+    intrinsics: Intrinsics,
+    /// They were scaled from the pose file's size.
+    rescaled: bool,
+}
+
+/// A picture on disk of another shape than the pose file's.
+struct Misfit {
+    /// Intrinsics of the pose file's size.
+    intrinsics: Intrinsics,
+    /// The picture's size.
+    got: String,
+}
+
+/// Computes the intrinsics of the picture on disk.
+fn stored_intrinsics(
+    draft: &Draft,
+    stored: &Probe,
+) -> std::result::Result<StoredIntrinsics, Misfit> {
+    let (w, h) = (stored.width as f64, stored.height as f64);
+    let (k, rescaled) = match draft.lens {
+        Lens::Normalised(k) => ([k[0] * w, k[1] * h, k[2] * w, k[3] * h], false),
+        Lens::Pixels(k) => {
+            let (given_w, given_h) = draft.size.unwrap_or((stored.width, stored.height));
+            let (sx, sy) = (w / given_w as f64, h / given_h as f64);
+            // A reduced copy (images_2, images_4) has sides rounded to whole pixels.
+            if (sx / sy - 1.0).abs() > 0.02 {
+                let turned = match stored.orientation {
+                    Some(o) => format!(" (EXIF orientation {o} is not applied)"),
+                    None => String::new(),
+                };
+                let got = format!("{}x{}{turned}", stored.width, stored.height);
+                let [fx, fy, cx, cy] = k.map(|v| v as f32);
+                let intrinsics = Intrinsics { fx, fy, cx, cy, width: given_w, height: given_h };
+                return Err(Misfit { intrinsics, got });
+            }
+            ([k[0] * sx, k[1] * sy, k[2] * sx, k[3] * sy], (sx, sy) != (1.0, 1.0))
+        }
+    };
+    let [fx, fy, cx, cy] = k.map(|v| v as f32);
+    let intrinsics = Intrinsics { fx, fy, cx, cy, width: stored.width, height: stored.height };
+    Ok(StoredIntrinsics { intrinsics, rescaled })
+}
+
+/// Makes an error of a refused camera at its place in a file.
+pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Error {
+    // Messages have the form "part: expected this, got that".
+    let text = error.to_string();
+    let parts = || {
+        let (part, rest) = text.split_once(": expected ")?;
+        let (expected, got) = rest.split_once(", got ")?;
+        Some((format!("a {part} with {expected}"), got.to_owned()))
+    };
+    let (expected, got) = parts().unwrap_or(("a camera".to_owned(), text.clone()));
+    Error::format(path, expected, got).at(place)
+}
+
+/// Makes frames of drafts: reads the header of every picture and checks every camera. A
+/// missing picture gives a warning and no frame. A picture of another shape than its camera's gives
+/// a warning and a frame that cannot be loaded, so that the indices of the others stay.
+pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> Result<Scene> {
+    if drafts.is_empty() {
+        return Err(Error::format(path, "at least one frame", "none"));
+    }
+    let probes: Vec<Option<Result<Probe>>> =
+        drafts.par_iter().map(|d| d.image.as_deref().map(|image| size(image, d.pixels))).collect();
+    let count = drafts.len();
+    let mut notes = Notes::default();
+    let mut frames: Vec<Frame> = Vec::with_capacity(count);
+    for (draft, stored) in drafts.into_iter().zip(probes) {
+        let (Some(image), Some(stored)) = (draft.image.clone(), stored) else {
+            notes.missing.push(draft.file);
+            continue;
+        };
+        frames.push(frame(path, draft, image, &stored?, &mut notes)?);
+    }
+    if frames.is_empty() {
+        let first = notes.missing.first().cloned().unwrap_or_default();
+        let got = format!("none of {count} (the first is `{first}`)");
+        return Err(Error::format(path, "pictures on disk", got));
+    }
+    // A reconstruction needs two, and every camera of a command line is meant to be used.
+    let usable = frames.iter().filter(|f| f.other_shape.is_none()).count();
+    if (usable < 2 || !source.has_file())
+        && let Some(error) = notes.other_shape_error.take()
+    {
+        return Err(error);
+    }
+    Ok(Scene {
+        name: scene_name(path),
+        frames,
+        points: None,
+        source,
+        units: Units::Unknown,
+        near_far: None,
+        warnings: notes.lines(count),
+    })
+}
+
+/// Reads the size of the pixels to which a camera refers.
+fn size(image: &Path, pixels: Pixels) -> Result<Probe> {
+    let stored = probe(image)?;
+    Ok(match pixels {
+        Pixels::Stored => stored,
+        Pixels::Upright => stored.upright(),
+    })
+}
+
+fn frame(
+    path: &Path,
+    draft: Draft,
+    image: PathBuf,
+    stored: &Probe,
+    notes: &mut Notes,
+) -> Result<Frame> {
+    let bad = |expected: String, got: String| {
+        Err(Error::format(path, expected, got).at(draft.place.clone()))
+    };
+    if stored.orientation.is_some() {
+        notes.with_orientation.push(draft.file.clone());
+    }
+    let mut other_shape = None;
+    let StoredIntrinsics { intrinsics, rescaled } = match stored_intrinsics(&draft, stored) {
+        Ok(k) => k,
+        Err(misfit) => {
+            let Misfit { intrinsics, got } = misfit;
+            let Intrinsics { width: w, height: h, .. } = intrinsics;
+            let expected = format!("{} of {w}x{h}, or of the same shape", image.display());
+            notes.other_shape.push(draft.file.clone());
+            notes.other_shape_error.get_or_insert_with(|| {
+                Error::format(path, expected, got.clone()).at(draft.place.clone())
+            });
+            other_shape = Some(got);
+            StoredIntrinsics { intrinsics, rescaled: false }
+        }
+    };
+    if rescaled {
+        notes.rescaled.push(draft.file.clone());
+    }
+    let OrthonormalPose { pose, error } = orthonormal(draft.world_from_camera);
+    if error > 1e-3 && error <= f64::from(Camera::RIGID_TOLERANCE) {
+        notes.skewed.push(draft.file.clone());
+    }
+    let camera = match Camera::new(intrinsics, pose.as_mat4()) {
+        Ok(camera) => camera,
+        Err(e) => return Err(camera_error(path, &draft.place, &e)),
+    };
+    if let Err(e) = draft.distortion.check() {
+        return bad("finite distortion coefficients".to_owned(), e);
+    }
+    let name = draft.file.replace('\\', "/");
+    let name = name.trim_start_matches("./").trim_start_matches("images/");
+    Ok(Frame {
+        name: Path::new(name).with_extension("").to_string_lossy().into_owned(),
+        image,
+        pixels: draft.pixels,
+        camera,
+        distortion: draft.distortion,
+        other_shape,
+        timestamp: draft.timestamp,
+        depth: draft.depth,
+        visible: draft.visible,
+    })
+}
+
+/// Files that give warnings, one line for each kind.
+#[derive(Default)]
+struct Notes {
+    missing: Vec<String>,
+    other_shape: Vec<String>,
+    /// Error of the first frame of `other_shape`.
+    other_shape_error: Option<Error>,
+    with_orientation: Vec<String>,
+    rescaled: Vec<String>,
+    skewed: Vec<String>,
+}
+
+impl Notes {
+    fn lines(&self, count: usize) -> Vec<String> {
+        let kinds = [
+            (&self.missing, "have no picture on disk and are left out"),
+            (
+                &self.other_shape,
+                "have pictures of another shape than the cameras' and cannot be used",
+            ),
+            (
+                &self.with_orientation,
+                "have an EXIF orientation: ignored, pose files refer to the stored pixels",
+            ),
+            (&self.rescaled, "are stored at another size than the pose file's: intrinsics scaled"),
+            (&self.skewed, "have a rotation that is not orthonormal (0.1 % to 1 %): corrected"),
+        ];
+        let line = |(files, what): (&Vec<String>, &str)| {
+            let few: Vec<&str> = files.iter().take(3).map(String::as_str).collect();
+            let more = if files.len() > 3 { ", …" } else { "" };
+            format!("{} of {count} frames {what}: {}{more}", files.len(), few.join(", "))
+        };
+        kinds.into_iter().filter(|(files, _)| !files.is_empty()).map(line).collect()
+    }
+}
+
+/// Derives the scene's name from the nearest folder that is not part of a format's layout.
+fn scene_name(pose_file: &Path) -> String {
+    let absolute = std::fs::canonicalize(pose_file).unwrap_or_else(|_| pose_file.to_owned());
+    let mut folder = if absolute.is_dir() { Some(absolute.as_path()) } else { absolute.parent() };
+    while let Some(f) = folder {
+        let name = f.file_name().unwrap_or_default().to_string_lossy();
+        let inner = ["sparse", "colmap", "images"].contains(&name.as_ref())
+            || name.chars().all(|c| c.is_ascii_digit())
+                && f.parent().is_some_and(|p| p.ends_with("sparse"));
+        if !inner && !name.is_empty() {
+            return name.into_owned();
+        }
+        folder = f.parent();
+    }
+    "scene".to_owned()
+}

@@ -1,0 +1,374 @@
+//! `cameras.json`: the layout of this project and of `subsplat run`, and the list of 3DGS
+//! training under the same name.
+//!
+//! ```json
+//! {"convention": "...", "units": "metres",
+//!  "frames": [{"file": "images/0.png", "width": 512, "height": 512,
+//!              "fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0,
+//!              "c2w": [[…], […], […], [0, 0, 0, 1]]}]}
+//! ```
+//!
+//! `c2w` is OpenCV camera-to-world; intrinsics are in pixels of the stored picture, without
+//! distortion. Optional keys of a frame are `timestamp_us`, `depth`, and `pixels`: `"upright"`
+//! if the camera refers to the picture with its EXIF orientation applied (default: `"stored"`).
+//! Optional keys of the file are `units` (`metres`, `re10k`) or `metric: true`, `near` and `far` (camera z in
+//! world units, for all frames), and `points`, a list of `[x, y, z]` of sparse points. Unknown
+//! keys are ignored.
+//!
+//! The list of 3DGS has `img_name, width, height, fx, fy, rotation` (camera to world),
+//! `position` (of the camera): the same axes, principal point in the middle.
+
+use super::assemble::{Draft, Lens, assemble, camera_error, find_image, orthonormal};
+use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
+use crate::files::{Error, Result, read, write_atomic};
+use glam::{DMat4, DVec4, Vec3};
+use serde::{Deserialize, Serialize};
+use std::io::Write;
+use std::path::Path;
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
+
+const CONVENTION: &str = "OpenCV camera-to-world (x right, y down, z forward); pixel intrinsics at \
+                          the stored resolution; pinhole";
+
+/// Value of the key `pixels` for [`Pixels::Upright`].
+const UPRIGHT: &str = "upright";
+
+/// A camera with the name of its picture, which need not exist.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NamedCamera {
+    /// Path of the picture, relative to the folder of the file.
+    pub file: String,
+    /// Pixels to which the camera refers.
+    pub pixels: Pixels,
+    /// The camera.
+    pub camera: Camera,
+    /// Time stamp, microseconds.
+    pub timestamp: Option<i64>,
+    /// Path of the depth map, relative to the folder of the file.
+    pub depth: Option<String>,
+}
+
+/// Content of a `cameras.json`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CameraFile {
+    /// Cameras in the file's order.
+    pub cameras: Vec<NamedCamera>,
+    /// Unit of length.
+    pub units: Units,
+    /// Nearest and farthest depth of the scene, camera z in world units.
+    pub near_far: Option<NearFar>,
+}
+
+/// Fields of the file that concern all frames.
+#[derive(Clone, Default)]
+struct FileInfo {
+    units: Units,
+    near_far: Option<NearFar>,
+    points: Option<Vec<Vec3>>,
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "an object with frames")]
+struct InFile {
+    units: Option<String>,
+    #[serde(default)]
+    metric: bool,
+    near: Option<f32>,
+    far: Option<f32>,
+    points: Option<Vec<[f32; 3]>>,
+    frames: Vec<InFrame>,
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "a frame: file, width, height, fx, fy, cx, cy, c2w")]
+struct InFrame {
+    file: String,
+    width: f64,
+    height: f64,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    c2w: Vec<Vec<f64>>,
+    timestamp_us: Option<i64>,
+    re10k_frame: Option<i64>,
+    depth: Option<String>,
+    pixels: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "a camera: img_name, width, height, fx, fy, rotation, position")]
+struct SplatFrame {
+    img_name: String,
+    width: f64,
+    height: f64,
+    fx: f64,
+    fy: f64,
+    rotation: [[f64; 3]; 3],
+    position: [f64; 3],
+}
+
+#[derive(Serialize)]
+struct OutFile<'a> {
+    convention: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    units: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    near: Option<f32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    far: Option<f32>,
+    frames: Vec<OutFrame<'a>>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    points: Vec<[f32; 3]>,
+}
+
+#[derive(Serialize)]
+struct OutFrame<'a> {
+    file: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pixels: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    depth: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    timestamp_us: Option<i64>,
+    width: usize,
+    height: usize,
+    fx: f32,
+    fy: f32,
+    cx: f32,
+    cy: f32,
+    c2w: [[f32; 4]; 4],
+}
+
+/// Makes an error of a JSON error, with its line and column; serde's message has the
+/// expected and the found value.
+pub(super) fn json_error(path: &Path, expected: &str, error: &serde_json::Error) -> Error {
+    let text = error.to_string();
+    // serde_json appends the place, which `at` holds.
+    let got = text.split(" at line ").next().unwrap_or(&text).to_owned();
+    let place = format!(":{}:{}", error.line(), error.column());
+    let at = if error.line() > 0 { place } else { String::new() };
+    Error::format(path, expected, got).at(at)
+}
+
+/// Converts a JSON number to the side of a picture.
+pub(super) fn side(value: f64) -> Option<usize> {
+    (value >= 1.0 && value <= f64::from(1 << 20) && value.fract() == 0.0).then_some(value as usize)
+}
+
+/// Converts the rows of a 3×4 or 4×4 matrix.
+pub(super) fn matrix(rows: &[Vec<f64>]) -> std::result::Result<DMat4, String> {
+    let shape_ok = (3..=4).contains(&rows.len()) && rows.iter().all(|r| r.len() == 4);
+    if !shape_ok {
+        let lengths: Vec<usize> = rows.iter().map(Vec::len).collect();
+        return Err(format!("rows of {lengths:?} numbers"));
+    }
+    let row = |i: usize| rows.get(i).map_or(DVec4::W, |r| DVec4::new(r[0], r[1], r[2], r[3]));
+    Ok(DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose())
+}
+
+/// Reports whether a pose file has this layout: `cameras.json` by its name, and any other
+/// JSON file but `transforms.json` that begins with a camera of this layout.
+///
+/// # Errors
+/// A file of another name that is not JSON.
+pub fn is_cameras_json(path: impl AsRef<Path>) -> Result<bool> {
+    has_this_layout(path.as_ref())
+}
+
+fn has_this_layout(path: &Path) -> Result<bool> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    if ["cameras.json", "transforms.json"].contains(&&*name) || !name.ends_with(".json") {
+        return Ok(name == "cameras.json");
+    }
+    let value: serde_json::Value = serde_json::from_slice(&read(path)?)
+        .map_err(|e| json_error(path, "a JSON file with cameras", &e))?;
+    Ok(value.is_array() || value["frames"][0].get("c2w").is_some())
+}
+
+fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
+    let bytes = read(path)?;
+    let list = bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[');
+    if list {
+        let frames: Vec<SplatFrame> = serde_json::from_slice(&bytes)
+            .map_err(|e| json_error(path, "a list of 3DGS cameras (img_name, rotation, …)", &e))?;
+        let drafts = frames.into_iter().enumerate().map(|(i, f)| splat_draft(path, i, f));
+        return Ok((drafts.collect::<Result<_>>()?, FileInfo::default()));
+    }
+    let file: InFile = serde_json::from_slice(&bytes)
+        .map_err(|e| json_error(path, "cameras.json (frames with file, fx, …, c2w)", &e))?;
+    let re10k = |f: &InFrame| f.timestamp_us.is_some() || f.re10k_frame.is_some();
+    let units = match file.units.as_deref() {
+        Some("metres" | "meters" | "m") => Units::Metres,
+        Some("re10k") => Units::RealEstate10k,
+        None if file.metric => Units::Metres,
+        None if !file.frames.is_empty() && file.frames.iter().all(re10k) => Units::RealEstate10k,
+        _ => Units::Unknown,
+    };
+    let near_far = match (file.near, file.far) {
+        (Some(near), Some(far)) if NearFar::new(near, far).is_valid() => {
+            Some(NearFar::new(near, far))
+        }
+        (None, None) => None,
+        (near, far) => {
+            let got = format!("near {near:?}, far {far:?}");
+            return Err(Error::format(path, "both near and far, 0 < near < far", got));
+        }
+    };
+    let points = file.points.map(|p| p.into_iter().map(Vec3::from).collect::<Vec<_>>());
+    if let Some(bad) = points.iter().flatten().find(|p| !p.is_finite()) {
+        return Err(Error::format(path, "finite points", format!("{bad}")));
+    }
+    let drafts = file.frames.into_iter().enumerate().map(|(i, f)| draft(path, i, f));
+    Ok((drafts.collect::<Result<_>>()?, FileInfo { units, near_far, points }))
+}
+
+fn size(path: &Path, place: &str, width: f64, height: f64) -> Result<Option<(usize, usize)>> {
+    match (side(width), side(height)) {
+        (Some(w), Some(h)) => Ok(Some((w, h))),
+        _ => {
+            let got = format!("{width}x{height}");
+            Err(Error::format(path, "a picture size in whole pixels", got).at(place))
+        }
+    }
+}
+
+fn draft(path: &Path, index: usize, f: InFrame) -> Result<Draft> {
+    let place = format!(" frame {index}");
+    let pose =
+        matrix(&f.c2w).map_err(|got| Error::format(path, "c2w of 4x4 numbers", got).at(&place))?;
+    let size = size(path, &place, f.width, f.height)?;
+    let lens = Lens::Pixels([f.fx, f.fy, f.cx, f.cy]);
+    let pixels = match f.pixels.as_deref() {
+        None | Some("stored") => Pixels::Stored,
+        Some(UPRIGHT) => Pixels::Upright,
+        Some(other) => {
+            let expected = "pixels `stored` or `upright`";
+            return Err(Error::format(path, expected, format!("`{other}`")).at(place));
+        }
+    };
+    let depth = f.depth.map(|d| folder(path).join(d));
+    let draft = Draft::new(place, f.file, lens, pose);
+    Ok(Draft { size, pixels, timestamp: f.timestamp_us, depth, ..draft })
+}
+
+fn splat_draft(path: &Path, index: usize, f: SplatFrame) -> Result<Draft> {
+    let place = format!(" frame {index}");
+    let rows: Vec<Vec<f64>> =
+        (0..3).map(|i| [&f.rotation[i][..], &[f.position[i]]].concat()).collect();
+    let pose = matrix(&rows)
+        .map_err(|got| Error::format(path, "rotation of 3x3 numbers", got).at(&place))?;
+    let size = size(path, &place, f.width, f.height)?;
+    let lens = Lens::Pixels([f.fx, f.fy, 0.5 * f.width, 0.5 * f.height]);
+    Ok(Draft { size, ..Draft::new(place, f.img_name, lens, pose) })
+}
+
+fn folder(path: &Path) -> &Path {
+    path.parent().unwrap_or(Path::new(""))
+}
+
+/// Reads a scene. Frames without a picture are left out with a warning.
+pub(super) fn load(path: &Path) -> Result<Scene> {
+    let (mut drafts, info) = drafts(path)?;
+    for d in &mut drafts {
+        d.image = find_image(&[folder(path)], &d.file);
+    }
+    let mut scene = assemble(path, SceneFormat::CamerasJson, drafts)?;
+    scene.units = info.units;
+    scene.near_far = info.near_far;
+    scene.points = info.points;
+    Ok(scene)
+}
+
+/// Reads the cameras; their pictures need not exist.
+///
+/// # Errors
+/// Another layout; an invalid camera (the error names its frame).
+pub fn load_cameras_json(path: impl AsRef<Path>) -> Result<CameraFile> {
+    read_cameras(path.as_ref())
+}
+
+fn read_cameras(path: &Path) -> Result<CameraFile> {
+    let (drafts, info) = drafts(path)?;
+    let mut cameras = Vec::with_capacity(drafts.len());
+    for d in drafts {
+        let (Some((width, height)), Lens::Pixels(k)) = (d.size, d.lens) else { continue };
+        let [fx, fy, cx, cy] = k.map(|v| v as f32);
+        let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
+        let pose = orthonormal(d.world_from_camera).pose;
+
+        let camera = Camera::new(intrinsics, pose.as_mat4())
+            .map_err(|e| camera_error(path, &d.place, &e))?;
+        let depth = d
+            .depth
+            .as_deref()
+            .map(|p| p.strip_prefix(folder(path)).unwrap_or(p).to_string_lossy().into_owned());
+        let (file, pixels, timestamp) = (d.file, d.pixels, d.timestamp);
+        cameras.push(NamedCamera { file, pixels, camera, timestamp, depth });
+    }
+    Ok(CameraFile { cameras, units: info.units, near_far: info.near_far })
+}
+
+/// Writes this layout. Floats have enough digits to read back exactly.
+///
+/// # Errors
+/// Errors of [`write_atomic`].
+pub fn save_cameras_json(path: impl AsRef<Path>, content: &CameraFile) -> Result<()> {
+    save_cameras_and_points(path, content, &[])
+}
+
+/// Writes this layout with sparse points, world units, from which [`super::scene::load_scene`]'s
+/// callers take near and far.
+///
+/// # Errors
+/// Errors of [`write_atomic`].
+pub fn save_cameras_and_points(
+    path: impl AsRef<Path>,
+    content: &CameraFile,
+    points: &[Vec3],
+) -> Result<()> {
+    write_cameras_and_points(path.as_ref(), content, points)
+}
+
+fn write_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) -> Result<()> {
+    let frame = |c: &'_ NamedCamera| {
+        let Intrinsics { fx, fy, cx, cy, width, height } = c.camera.intrinsics();
+        let c2w = c.camera.world_from_camera().transpose().to_cols_array_2d();
+        (fx, fy, cx, cy, width, height, c2w)
+    };
+    let frames = content.cameras.iter().map(|c| {
+        let (fx, fy, cx, cy, width, height, c2w) = frame(c);
+        let file = c.file.as_str();
+        let depth = c.depth.as_deref();
+        let timestamp_us = c.timestamp;
+        let pixels = (c.pixels == Pixels::Upright).then_some(UPRIGHT);
+        OutFrame { file, pixels, depth, timestamp_us, width, height, fx, fy, cx, cy, c2w }
+    });
+    let units = match content.units {
+        Units::Unknown => None,
+        Units::Metres => Some("metres"),
+        Units::RealEstate10k => Some("re10k"),
+    };
+    let (near, far) = content.near_far.map(|range| (range.near, range.far)).unzip();
+    let frames = frames.collect();
+    let points = points.iter().map(Vec3::to_array).collect();
+    let out = OutFile { convention: CONVENTION, units, near, far, frames, points };
+    let text = serde_json::to_string_pretty(&out)
+        .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
+    write_atomic(path, |f| writeln!(f, "{text}"))
+}
+
+impl NamedCamera {
+    /// Makes a named camera of a stored picture at the path `file`, without time stamp and
+    /// depth map.
+    pub fn new(file: impl Into<String>, camera: Camera) -> Self {
+        Self { file: file.into(), pixels: Pixels::Stored, camera, timestamp: None, depth: None }
+    }
+
+    /// Makes a named camera of a frame's camera and the new path `file` of its picture. A file
+    /// that is written anew has upright pixels, for which both values of [`Pixels`] agree.
+    pub fn of_frame(frame: &Frame, file: impl Into<String>) -> Self {
+        let (pixels, timestamp) = (frame.pixels, frame.timestamp);
+        Self { pixels, timestamp, ..Self::new(file, frame.camera) }
+    }
+}

@@ -1,0 +1,247 @@
+//! COLMAP's sparse model: `cameras`, `images` and `points3D`, binary or text.
+//!
+//! Poses in the file are camera-from-world (quaternion wxyz and translation), OpenCV
+//! axes; pixel centres lie at +0.5, as here. `rigs.*` and `frames.*` of COLMAP 4 are
+//! ignored: `images.*` still holds every pose. Distortion is removed when a frame is
+//! loaded ([`crate::files::photos::undistort`]). Camera models read: SIMPLE_PINHOLE, PINHOLE,
+//! SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE, FULL_OPENCV,
+//! SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, SIMPLE_FISHEYE, FISHEYE; others are refused
+//! by name.
+//!
+//! Frames are sorted by picture name, as COLMAP's image ids follow no order.
+//! Layout: COLMAP, `src/colmap/scene/reconstruction_io_{binary,text}` and the
+//! documentation page "Output Format".
+
+mod binary;
+mod text;
+mod write;
+
+use super::assemble::{Draft, Lens, assemble, find_image};
+use super::scene::{Scene, SceneFormat};
+use crate::files::photos::undistort::Distortion;
+use crate::files::{Error, Result, read};
+use glam::{DMat4, DQuat, DVec3, Vec3};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+pub use binary::parse_points as parse_points_bin;
+pub use binary::{parse_cameras as parse_cameras_bin, parse_images as parse_images_bin};
+pub use write::{SparsePoint, save_colmap};
+
+pub use text::parse_points as parse_points_txt;
+pub use text::{parse_cameras as parse_cameras_txt, parse_images as parse_images_txt};
+
+/// One camera of `cameras.*`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ColmapCamera {
+    /// Picture width, px.
+    pub width: usize,
+    /// Picture height, px.
+    pub height: usize,
+    /// fx, fy, cx, cy, px.
+    pub focal_and_center: [f64; 4],
+    /// Lens distortion.
+    pub distortion: Distortion,
+}
+
+/// One picture of `images.*`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ColmapImage {
+    /// Place in the file, in the form of [`Error::at`].
+    pub place: String,
+    /// Rotation, camera from world, unit.
+    pub rotation: DQuat,
+    /// Translation, camera from world.
+    pub translation: DVec3,
+    /// Key into the cameras.
+    pub camera: u32,
+    /// Path below the picture folder.
+    pub name: String,
+    /// Ids of the points that the picture observes.
+    pub points: Vec<u64>,
+}
+
+/// Cameras by id.
+pub type Cameras = HashMap<u32, ColmapCamera>;
+/// Id and position of each point.
+pub type Points = Vec<(u64, Vec3)>;
+
+/// Reports whether `folder` holds a model.
+pub(super) fn is_model(folder: &Path) -> bool {
+    ["bin", "txt"].iter().any(|e| {
+        folder.join(format!("cameras.{e}")).is_file()
+            && folder.join(format!("images.{e}")).is_file()
+    })
+}
+
+/// COLMAP's camera models by number: name and number of parameters. Models that [`lens`]
+/// does not support are listed so that errors name them.
+const MODELS: [(&str, usize); 16] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+];
+
+/// For messages.
+const MODELS_READ: &str = "a camera model among SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, \
+                           OPENCV, OPENCV_FISHEYE, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, \
+                           RADIAL_FISHEYE, SIMPLE_FISHEYE, FISHEYE";
+
+/// Focal lengths, principal point and distortion of a camera.
+struct LensParameters {
+    focal_and_center: [f64; 4],
+    distortion: Distortion,
+}
+
+/// Interprets the parameters of `model`; their number is that of [`MODELS`].
+fn lens(model: &str, p: &[f64]) -> Option<LensParameters> {
+    let one_focal = |distortion| {
+        let focal_and_center = [p[0], p[0], p[1], p[2]];
+        LensParameters { focal_and_center, distortion }
+    };
+    let one = |k: [f64; 6]| one_focal(Distortion::brown(k, [0.0; 2]));
+    let one_fisheye = |k: [f64; 4]| one_focal(Distortion::fisheye(k));
+    let two = |distortion| {
+        let focal_and_center = [p[0], p[1], p[2], p[3]];
+        LensParameters { focal_and_center, distortion }
+    };
+    Some(match model {
+        "SIMPLE_PINHOLE" => one([0.0; 6]),
+        "PINHOLE" => two(Distortion::None),
+        "SIMPLE_RADIAL" => one([p[3], 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "RADIAL" => one([p[3], p[4], 0.0, 0.0, 0.0, 0.0]),
+        "OPENCV" => two(Distortion::brown([p[4], p[5], 0.0, 0.0, 0.0, 0.0], [p[6], p[7]])),
+        "FULL_OPENCV" => {
+            two(Distortion::brown([p[4], p[5], p[8], p[9], p[10], p[11]], [p[6], p[7]]))
+        }
+        "OPENCV_FISHEYE" => two(Distortion::fisheye([p[4], p[5], p[6], p[7]])),
+        "SIMPLE_RADIAL_FISHEYE" => one_fisheye([p[3], 0.0, 0.0, 0.0]),
+        "RADIAL_FISHEYE" => one_fisheye([p[3], p[4], 0.0, 0.0]),
+        "SIMPLE_FISHEYE" => one_fisheye([0.0; 4]),
+        "FISHEYE" => two(Distortion::fisheye([0.0; 4])),
+        _ => return None,
+    })
+}
+
+/// An error without its place in the file.
+struct Refusal {
+    expected: String,
+    got: String,
+}
+
+/// Makes a camera of `size` (width, height), px.
+fn camera(
+    model: &str,
+    size: [u64; 2],
+    parameters: &[f64],
+) -> std::result::Result<ColmapCamera, Refusal> {
+    let refuse = |expected: &str, got: String| Refusal { expected: expected.to_owned(), got };
+    let side = |v: u64| (1..=1 << 20).contains(&v).then_some(v as usize);
+    let [Some(width), Some(height)] = size.map(side) else {
+        let got = format!("{}x{}", size[0], size[1]);
+        return Err(refuse("a picture of 1x1 to 1048576x1048576", got));
+    };
+    if parameters.iter().any(|v| !v.is_finite()) {
+        return Err(refuse("finite camera parameters", format!("{parameters:?}")));
+    }
+    let LensParameters { focal_and_center, distortion } =
+        lens(model, parameters).ok_or_else(|| refuse(MODELS_READ, model.to_owned()))?;
+    Ok(ColmapCamera { width, height, focal_and_center, distortion })
+}
+
+/// Normalises the file's quaternion w, x, y, z.
+fn rotation(q: [f64; 4]) -> Option<DQuat> {
+    let quat = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
+    let length = quat.length();
+    (length.is_finite() && length > 1e-6).then(|| quat * (1.0 / length))
+}
+
+/// Reads the model in `folder`. Pictures may lie beside it, in its parents, and in an
+/// `images` folder of any of them.
+pub(super) fn load(folder: &Path) -> Result<Scene> {
+    let binary = folder.join("cameras.bin").is_file() && folder.join("images.bin").is_file();
+    let extension = if binary { "bin" } else { "txt" };
+    let path = |stem: &str| folder.join(format!("{stem}.{extension}"));
+    let (cameras_path, images_path, points_path) =
+        (path("cameras"), path("images"), path("points3D"));
+    let mut warnings = Vec::new();
+
+    let bytes = read(&cameras_path)?;
+    let cameras = if binary {
+        parse_cameras_bin(&cameras_path, &bytes)?
+    } else {
+        parse_cameras_txt(&cameras_path, &bytes)?
+    };
+    let bytes = read(&images_path)?;
+    let mut images = if binary {
+        parse_images_bin(&images_path, &bytes)?
+    } else {
+        parse_images_txt(&images_path, &bytes, &mut warnings)?
+    };
+    let points = if points_path.is_file() {
+        let bytes = read(&points_path)?;
+        if binary {
+            parse_points_bin(&points_path, &bytes)?
+        } else {
+            parse_points_txt(&points_path, &bytes)?
+        }
+    } else {
+        warnings.push(format!("{} is missing: no sparse points", points_path.display()));
+        Points::new()
+    };
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+
+    let index: HashMap<u64, u32> =
+        points.iter().enumerate().map(|(i, (id, _))| (*id, i as u32)).collect();
+    let roots: Vec<PathBuf> = folder.ancestors().take(4).map(Path::to_owned).collect();
+    let roots: Vec<&Path> = roots.iter().map(PathBuf::as_path).collect();
+    let drafts = images
+        .into_iter()
+        .map(|image| draft(&images_path, image, &cameras, &index, &roots))
+        .collect::<Result<Vec<_>>>()?;
+    let mut scene = assemble(&images_path, SceneFormat::Colmap, drafts)?;
+    scene.points = (!points.is_empty()).then(|| points.into_iter().map(|(_, p)| p).collect());
+    warnings.append(&mut scene.warnings);
+    scene.warnings = warnings;
+    Ok(scene)
+}
+
+fn draft(
+    path: &Path,
+    image: ColmapImage,
+    cameras: &Cameras,
+    index: &HashMap<u64, u32>,
+    roots: &[&Path],
+) -> Result<Draft> {
+    let Some(camera) = cameras.get(&image.camera) else {
+        let got = format!("camera {}", image.camera);
+        return Err(Error::format(path, "a camera id of the cameras file", got).at(image.place));
+    };
+    // The inverse of (R, t): (Rᵀ, −Rᵀt).
+    let back = image.rotation.conjugate();
+    let pose = DMat4::from_rotation_translation(back, -(back * image.translation));
+    let mut visible: Vec<u32> =
+        image.points.iter().filter_map(|id| index.get(id).copied()).collect();
+    visible.sort_unstable();
+    visible.dedup();
+    Ok(Draft {
+        image: find_image(roots, &image.name),
+        size: Some((camera.width, camera.height)),
+        distortion: camera.distortion,
+        visible,
+        ..Draft::new(image.place, image.name, Lens::Pixels(camera.focal_and_center), pose)
+    })
+}

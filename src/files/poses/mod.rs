@@ -1,0 +1,10 @@
+//! Cameras of photographs, in every layout that is read or written.
+
+pub(super) mod assemble;
+pub mod cameras_json;
+pub mod colmap;
+pub mod matrices;
+pub mod protocol;
+pub mod re10k;
+pub mod scene;
+pub mod transforms;

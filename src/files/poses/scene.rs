@@ -1,0 +1,314 @@
+//! Posed photographs: one type for every pose format, and the detection of formats.
+//!
+//! A [`Scene`] has OpenCV cameras (`world_from_camera`) and intrinsics in pixels of the
+//! stored picture, pixel centres at +0.5 (`camera.rs`), in every format. The precedence of
+//! pose files in a folder is: `cameras.json`, `transforms.json`, COLMAP, RealEstate10K txt,
+//! `poses.txt` with `K.txt`. The path of a pose file selects that file.
+//!
+//! Pose files refer to the stored pixels ([`Pixels::Stored`]): EXIF orientation is not applied,
+//! and a picture with one gives a warning. Cameras of photographs without a pose file refer to
+//! the upright pixels ([`Pixels::Upright`]).
+
+use super::assemble::{Draft, Lens, assemble};
+use super::{cameras_json, colmap, matrices, re10k, transforms};
+use crate::files::photos::image::{LoadOptions, LoadedPicture, load_with};
+use crate::files::photos::photograph::load_photograph;
+use crate::files::photos::undistort::{Distortion, pinhole, undistort};
+use crate::files::{Error, Result};
+use crate::scene::pictures::Rgb;
+use glam::Vec3;
+use std::path::{Path, PathBuf};
+use subsplat_kernels::camera::{Camera, NearFar};
+
+/// The format of a scene's pose file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SceneFormat {
+    /// `cameras.json` of `subsplat run`, or the list of 3DGS.
+    CamerasJson,
+    /// nerfstudio's and instant-ngp's `transforms.json`.
+    Transforms,
+    /// COLMAP's sparse model, binary or text.
+    Colmap,
+    /// RealEstate10K's camera txt.
+    RealEstate10k,
+    /// `poses.txt` with `K.txt`.
+    Matrices,
+    /// Two pictures with cameras from the command line.
+    Pair,
+    /// Photographs whose cameras were estimated from the photographs alone.
+    Photographs,
+}
+
+impl SceneFormat {
+    /// Returns the format's name for messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::CamerasJson => "cameras.json",
+            Self::Transforms => "transforms.json",
+            Self::Colmap => "COLMAP",
+            Self::RealEstate10k => "RealEstate10K txt",
+            Self::Matrices => "poses.txt with K.txt",
+            Self::Pair => "two pictures with given cameras",
+            Self::Photographs => "photographs with estimated cameras",
+        }
+    }
+
+    /// Returns whether the cameras come from a file.
+    pub fn has_file(self) -> bool {
+        !matches!(self, Self::Pair | Self::Photographs)
+    }
+}
+
+/// The scene's unit of length.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Units {
+    /// Not known.
+    #[default]
+    Unknown,
+    /// Metres.
+    Metres,
+    /// The scale of RealEstate10K, used with near 1 and far 100 by convention.
+    RealEstate10k,
+}
+
+/// The pixels to which a camera refers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Pixels {
+    /// The file's pixels as they are stored. Pose files refer to these.
+    #[default]
+    Stored,
+    /// The pixels after the EXIF orientation is applied.
+    Upright,
+}
+
+/// One posed photograph.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Path of the picture in the pose file, without leading `images/` and extension.
+    pub name: String,
+    /// Path of the picture on disk.
+    pub image: PathBuf,
+    /// Pixels to which camera, distortion and depth map refer.
+    pub pixels: Pixels,
+    /// Camera of the picture without [`Frame::distortion`].
+    pub camera: Camera,
+    /// Lens distortion of the picture.
+    pub distortion: Distortion,
+    /// Size of the stored picture where it has another shape than the camera's. Such a frame cannot
+    /// be loaded, and [`Scene::usable`] leaves it out.
+    pub other_shape: Option<String>,
+    /// Time stamp of a video frame, microseconds (RealEstate10K).
+    pub timestamp: Option<i64>,
+    /// 16-bit depth map of the picture, if the pose file names one.
+    pub depth: Option<PathBuf>,
+    /// Indices into [`Scene::points`] of the points that this frame observes.
+    pub visible: Vec<u32>,
+}
+
+/// Picture, camera and warnings of a [`Frame`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct LoadedFrame {
+    /// The picture without lens distortion.
+    pub picture: Rgb,
+    /// Pinhole camera of the picture.
+    pub camera: Camera,
+    /// Warnings about the file, one line each, with its path.
+    pub warnings: Vec<String>,
+}
+
+impl Frame {
+    /// Returns the camera of [`Frame::load`]'s picture.
+    ///
+    /// # Errors
+    /// A distortion that cannot be removed.
+    pub fn pinhole(&self) -> Result<Camera> {
+        let intrinsics = pinhole(&self.camera.intrinsics(), &self.distortion).map_err(|got| {
+            Error::format(&self.image, "a lens distortion that can be undone", got)
+        })?;
+        self.camera
+            .with_intrinsics(intrinsics)
+            .map_err(|e| Error::format(&self.image, "a valid camera", e.to_string()))
+    }
+
+    /// Decodes the picture, turns it upright if [`Frame::pixels`] says so, and removes the lens
+    /// distortion.
+    ///
+    /// # Errors
+    /// Errors of [`crate::files::photos::image::load`]; a size that is not the camera's.
+    pub fn load(&self) -> Result<(Rgb, Camera)> {
+        let LoadedFrame { picture, camera, .. } = self.load_with(&LoadOptions::default())?;
+        Ok((picture, camera))
+    }
+
+    /// Loads the frame as [`Frame::load`] does, with options, and returns the warnings.
+    ///
+    /// # Errors
+    /// Errors of [`crate::files::photos::image::load_with`]; a size that is not the camera's.
+    pub fn load_with(&self, options: &LoadOptions) -> Result<LoadedFrame> {
+        if let Some(got) = &self.other_shape {
+            let k = &self.camera.intrinsics();
+            let expected = format!("a picture of {}x{}, or of the same shape", k.width, k.height);
+            return Err(Error::format(&self.image, expected, got));
+        }
+        let LoadedPicture { picture, warnings } = match self.pixels {
+            Pixels::Stored => load_with(&self.image, options)?,
+            Pixels::Upright => {
+                let photograph = load_photograph(&self.image, options)?;
+                let (picture, warnings) = (photograph.image, photograph.warnings);
+                LoadedPicture { picture, warnings }
+            }
+        };
+        let k = &self.camera.intrinsics();
+        if (picture.width, picture.height) != (k.width, k.height) {
+            let got = format!("{}x{}", picture.width, picture.height);
+            return Err(Error::format(&self.image, format!("{}x{}", k.width, k.height), got));
+        }
+        let camera = self.pinhole()?;
+        let picture = match self.distortion {
+            Distortion::None => picture,
+            _ => undistort(&picture, k, &self.distortion, &camera.intrinsics()),
+        };
+        Ok(LoadedFrame { picture, camera, warnings })
+    }
+}
+
+/// A set of posed photographs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    /// Name of the folder.
+    pub name: String,
+    /// At least one frame, in the pose file's order (COLMAP: by name).
+    pub frames: Vec<Frame>,
+    /// Sparse points of a reconstruction, world coordinates.
+    pub points: Option<Vec<Vec3>>,
+    /// Format of the pose file.
+    pub source: SceneFormat,
+    /// Unit of length.
+    pub units: Units,
+    /// Nearest and farthest depth of the pose file, camera z in world units.
+    pub near_far: Option<NearFar>,
+    /// Warnings for the user, one line each.
+    pub warnings: Vec<String>,
+}
+
+impl Scene {
+    /// Indices of the frames that can be loaded, as far as the headers of their pictures say.
+    pub fn usable(&self) -> Vec<usize> {
+        (0..self.frames.len()).filter(|&i| self.frames[i].other_shape.is_none()).collect()
+    }
+
+    /// Makes a scene of two photographs and their cameras. The cameras refer to the
+    /// upright pixels ([`Pixels::Upright`]) and have the upright pictures' sizes.
+    ///
+    /// # Errors
+    /// A picture that is missing, malformed or of another size.
+    pub fn from_pair(
+        a: impl AsRef<Path>,
+        b: impl AsRef<Path>,
+        camera_a: Camera,
+        camera_b: Camera,
+    ) -> Result<Self> {
+        let (a, b) = (a.as_ref(), b.as_ref());
+        let photographs = [(a.to_owned(), camera_a), (b.to_owned(), camera_b)];
+        Self::from_photographs(SceneFormat::Pair, a, &photographs)
+    }
+
+    /// Makes a scene of photographs and the cameras of their upright pixels. `path` names the
+    /// scene in messages.
+    ///
+    /// # Errors
+    /// As [`Scene::from_pair`].
+    pub fn from_photographs(
+        source: SceneFormat,
+        path: impl AsRef<Path>,
+        photographs: &[(PathBuf, Camera)],
+    ) -> Result<Self> {
+        assemble(path.as_ref(), source, photographs.iter().map(upright_draft).collect())
+    }
+}
+
+/// Returns a frame of a photograph and the camera of its upright pixels.
+fn upright_draft((path, camera): &(PathBuf, Camera)) -> Draft {
+    let k = camera.intrinsics();
+    Draft {
+        size: Some((k.width, k.height)),
+        pixels: Pixels::Upright,
+        image: Some(path.clone()),
+        ..Draft::new(
+            String::new(),
+            path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            Lens::Pixels([k.fx, k.fy, k.cx, k.cy].map(f64::from)),
+            camera.world_from_camera().as_dmat4(),
+        )
+    }
+}
+
+/// Folders of a scene in which COLMAP's model may lie.
+const MODEL_FOLDERS: [&str; 4] = ["sparse/0", "sparse", "colmap/sparse/0", ""];
+
+/// Reads the scene of a folder or of a pose file.
+///
+/// # Errors
+/// No pose file; a malformed pose file (the error names file and line or byte); no picture;
+/// a picture whose size does not match its camera.
+pub fn load_scene(path: impl AsRef<Path>) -> Result<Scene> {
+    load_at(path.as_ref())
+}
+
+fn load_at(path: &Path) -> Result<Scene> {
+    let metadata = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+    if metadata.is_file() {
+        return load_file(path);
+    }
+    for name in ["cameras.json", "transforms.json"] {
+        let file = path.join(name);
+        if file.is_file() {
+            return load_file(&file);
+        }
+    }
+    for folder in MODEL_FOLDERS {
+        let model = path.join(folder);
+        if colmap::is_model(&model) {
+            return colmap::load(&model);
+        }
+    }
+    if let Some(file) = re10k::find(path)? {
+        return re10k::load(&file);
+    }
+    if path.join("poses.txt").is_file() {
+        return matrices::load(path, matrices::PoseConvention::default());
+    }
+    Err(Error::format(
+        path,
+        "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, or \
+         poses.txt with K.txt",
+        "a folder with none of them",
+    ))
+}
+
+/// Reports whether `path` is a folder with a pose file that [`load_scene`] reads.
+pub fn is_scene(path: impl AsRef<Path>) -> bool {
+    let path = path.as_ref();
+    let file = |name: &str| path.join(name).is_file();
+    ["cameras.json", "transforms.json", "poses.txt"].into_iter().any(file)
+        || MODEL_FOLDERS.iter().any(|f| colmap::is_model(&path.join(f)))
+        || re10k::find(path).is_ok_and(|f| f.is_some())
+}
+
+fn load_file(path: &Path) -> Result<Scene> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    match (name.as_str(), extension.as_str()) {
+        (_, "json") if cameras_json::is_cameras_json(path)? => cameras_json::load(path),
+        (_, "json") => transforms::load(path),
+        ("cameras.txt" | "images.txt" | "points3d.txt", _) | (_, "bin") => colmap::load(folder),
+        ("poses.txt" | "k.txt", _) => matrices::load(folder, matrices::PoseConvention::default()),
+        (_, "txt") => re10k::load(path),
+        _ => Err(Error::format(
+            path,
+            "a folder or a pose file (.json, .txt, .bin)",
+            format!("a file with extension `{extension}`"),
+        )),
+    }
+}

@@ -1,0 +1,182 @@
+//! `transforms.json` of nerfstudio and instant-ngp.
+//!
+//! Poses are OpenGL camera-to-world (x right, y up, −z forward); the reader negates the
+//! second and third column. Intrinsics are in pixels, per file or per frame: `fl_x`, `fl_y`
+//! (else `fl_x`), `cx`, `cy` (else the middle), `w`, `h` (else the stored picture's). Files
+//! without `fl_x` have `camera_angle_x` and `camera_angle_y` in radians. Camera models: none
+//! given, SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
+//! OPENCV_FISHEYE. Other keys (`aabb_scale`, `sharpness`, `ply_file_path`, …) are ignored.
+
+use super::assemble::{Draft, Lens, assemble, find_image};
+use super::cameras_json::{json_error, matrix, side};
+use super::scene::{Scene, SceneFormat};
+use crate::files::photos::undistort::Distortion;
+use crate::files::{Error, Result, read};
+use glam::{DMat4, DVec4};
+use serde::Deserialize;
+use std::path::Path;
+
+/// Keys of the file, of a frame, or of both; a frame's value takes precedence.
+#[derive(Deserialize, Default, Clone)]
+#[serde(expecting = "an object")]
+struct Optics {
+    camera_model: Option<String>,
+    is_fisheye: Option<bool>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    w: Option<f64>,
+    h: Option<f64>,
+    camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    k4: Option<f64>,
+    k5: Option<f64>,
+    k6: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+}
+
+impl Optics {
+    /// Takes the frame's values, and the file's where the frame has none.
+    fn over(self, file: &Self) -> Self {
+        Self {
+            camera_model: self.camera_model.or_else(|| file.camera_model.clone()),
+            is_fisheye: self.is_fisheye.or(file.is_fisheye),
+            fl_x: self.fl_x.or(file.fl_x),
+            fl_y: self.fl_y.or(file.fl_y),
+            cx: self.cx.or(file.cx),
+            cy: self.cy.or(file.cy),
+            w: self.w.or(file.w),
+            h: self.h.or(file.h),
+            camera_angle_x: self.camera_angle_x.or(file.camera_angle_x),
+            camera_angle_y: self.camera_angle_y.or(file.camera_angle_y),
+            k1: self.k1.or(file.k1),
+            k2: self.k2.or(file.k2),
+            k3: self.k3.or(file.k3),
+            k4: self.k4.or(file.k4),
+            k5: self.k5.or(file.k5),
+            k6: self.k6.or(file.k6),
+            p1: self.p1.or(file.p1),
+            p2: self.p2.or(file.p2),
+        }
+    }
+
+    fn distortion(&self) -> std::result::Result<Distortion, String> {
+        let k = [self.k1, self.k2, self.k3, self.k4, self.k5, self.k6].map(|v| v.unwrap_or(0.0));
+        let p = [self.p1, self.p2].map(|v| v.unwrap_or(0.0));
+        let model = self.camera_model.as_deref().unwrap_or("");
+        let fisheye = self.is_fisheye.unwrap_or(false);
+        match model.to_ascii_uppercase().as_str() {
+            "" | "OPENCV" | "FULL_OPENCV" if fisheye => {
+                Ok(Distortion::fisheye([k[0], k[1], k[2], k[3]]))
+            }
+            "OPENCV_FISHEYE" => Ok(Distortion::fisheye([k[0], k[1], k[2], k[3]])),
+            "SIMPLE_PINHOLE" | "PINHOLE" => Ok(Distortion::None),
+            // k4 to k6 are the denominator of FULL_OPENCV only: nerfstudio writes another
+            // k4 beside OPENCV.
+            "" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" => {
+                Ok(Distortion::brown([k[0], k[1], k[2], 0.0, 0.0, 0.0], p))
+            }
+            "FULL_OPENCV" => Ok(Distortion::brown(k, p)),
+            _ => Err(format!("`{model}`")),
+        }
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "an object with frames")]
+struct File {
+    #[serde(flatten)]
+    optics: Optics,
+    frames: Vec<FileFrame>,
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "a frame: file_path, transform_matrix")]
+struct FileFrame {
+    file_path: String,
+    transform_matrix: Vec<Vec<f64>>,
+    #[serde(flatten)]
+    optics: Optics,
+}
+
+/// Converts OpenGL camera axes to OpenCV's.
+pub(super) fn opengl_to_opencv(pose: DMat4) -> DMat4 {
+    pose * DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0))
+}
+
+/// Reads a scene. Frames without a picture are left out with a warning.
+pub(super) fn load(path: &Path) -> Result<Scene> {
+    let file: File = serde_json::from_slice(&read(path)?).map_err(|e| {
+        json_error(path, "transforms.json (frames with file_path, transform_matrix)", &e)
+    })?;
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let mut drafts = Vec::with_capacity(file.frames.len());
+    for (i, f) in file.frames.into_iter().enumerate() {
+        let place = format!(" frame {i}");
+        let bad = |expected: &str, got: String| Error::format(path, expected, got).at(&place);
+        let pose = matrix(&f.transform_matrix)
+            .map_err(|got| bad("transform_matrix of 4x4 numbers", got))?;
+        let optics = f.optics.over(&file.optics);
+        let distortion = optics.distortion().map_err(|got| {
+            bad(
+                "camera_model SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV \
+                 or OPENCV_FISHEYE",
+                got,
+            )
+        })?;
+        let size = match (optics.w, optics.h) {
+            (Some(w), Some(h)) => match (side(w), side(h)) {
+                (Some(w), Some(h)) => Some((w, h)),
+                _ => return Err(bad("w and h in whole pixels", format!("{w}x{h}"))),
+            },
+            _ => None,
+        };
+        let image = find_image(&[folder], &f.file_path);
+        // Pixel intrinsics without a size belong to the stored picture.
+        let stored = match (&image, size) {
+            (_, Some(s)) => Some(s),
+            (Some(image), None) => {
+                let probe = crate::files::photos::image::probe(image)?;
+                Some((probe.width, probe.height))
+            }
+            (None, None) => None,
+        };
+        let lens = lens(&optics, stored).map_err(|got| {
+            bad("fl_x, or camera_angle_x between 0 and π (for the file or the frame)", got)
+        })?;
+        let pose = opengl_to_opencv(pose);
+        drafts.push(Draft {
+            image,
+            size: stored,
+            distortion,
+            ..Draft::new(place, f.file_path, lens, pose)
+        });
+    }
+    assemble(path, SceneFormat::Transforms, drafts)
+}
+
+/// Computes pixel intrinsics for a picture of `size`. A frame without a size has no picture
+/// and is left out later; its intrinsics are not used.
+fn lens(o: &Optics, size: Option<(usize, usize)>) -> std::result::Result<Lens, String> {
+    let (w, h) = size.map_or((1.0, 1.0), |(w, h)| (w as f64, h as f64));
+    let focal = |side: f64, angle: Option<f64>| match angle {
+        Some(a) if a > 0.0 && a < std::f64::consts::PI => Ok(Some(0.5 * side / (0.5 * a).tan())),
+        Some(a) => Err(format!("an angle of {a}")),
+        None => Ok(None),
+    };
+    let fx = match o.fl_x {
+        Some(f) => f,
+        None => focal(w, o.camera_angle_x)?.ok_or("neither")?,
+    };
+    let fy = match (o.fl_y, o.fl_x) {
+        (Some(f), _) => f,
+        (None, Some(f)) => f,
+        (None, None) => focal(h, o.camera_angle_y)?.unwrap_or(fx),
+    };
+    Ok(Lens::Pixels([fx, fy, o.cx.unwrap_or(0.5 * w), o.cy.unwrap_or(0.5 * h)]))
+}

@@ -1,0 +1,231 @@
+//! The `.ply` of 3DGS (INRIA): writer, and reader of every variant in use.
+//!
+//! Layout: one element `vertex` with float properties `x y z`, `nx ny nz` (zero),
+//! `f_dc_0..2`, `f_rest_*` channel-major (all of R, then G, then B), `opacity` before
+//! the sigmoid, `scale_0..2` = ln σ, `rot_0..3` = wxyz. World frame throughout.
+//!
+//! SH degree: 3 by default, since viewers expect 45 `f_rest`: lower degrees are padded with
+//! zeros, which the reader drops again, and the network's degree 4 is dropped. Gains and residuals of children are folded into their coefficients
+//! (`gaussians.rs`).
+//!
+//! The reader accepts ascii and both byte orders, any property order and number type, 0, 9,
+//! 24, 45 or 72 `f_rest`, and `red green blue` in place of `f_dc` (nerfstudio). It skips
+//! other properties and elements, and refuses bytes after the last element.
+//! `compressed_ply.rs` reads PlayCanvas' packed files.
+
+use super::gaussians::{Decoded, Incoming, Outgoing, check_finite, dc_from_colour, logit, sigmoid};
+use super::ply_container::{Element, Header, Scalar, Source};
+use super::{SaveOptions, Up, compressed_ply};
+use crate::files::{Error, Result};
+use crate::scene::splats::Splats;
+use std::io::{BufRead, Write};
+use std::path::Path;
+
+/// Number of `f_rest` properties by SH degree.
+pub(super) const REST_COUNTS: [usize; 5] = [0, 9, 24, 45, 72];
+/// Gaussians per write: about 250 KiB at degree 3.
+const BLOCK: usize = 1024;
+
+/// Reads a `.ply` from memory: the plain layout of 3DGS or PlayCanvas' packed one.
+/// `name` is for errors.
+///
+/// # Errors
+/// Not a PLY, not a splat file, a truncated file, a count that the bytes do not bear out,
+/// bytes after the last element, numbers that are not finite.
+pub fn parse_ply(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
+    let name = name.as_ref();
+    let mut reader = bytes;
+    let decoded = decode(&mut reader, bytes.len() as u64, name)?;
+    check_finite(&decoded.splats, name)?;
+    Ok(decoded.splats)
+}
+
+/// Reads a file of `length` bytes from `reader`.
+pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Result<Decoded> {
+    let mut source = Source::new(reader, length, path);
+    let header = Header::read(&mut source)?;
+    if compressed_ply::is_compressed(&header) {
+        return compressed_ply::decode(header, &mut source);
+    }
+    let mut incoming = None;
+    for element in &header.elements {
+        if element.name == "vertex" && incoming.is_none() {
+            incoming = Some(read_vertices(&header, element, &mut source)?);
+        } else {
+            header.rows(element, &mut source, |_, _| Ok(()))?;
+        }
+    }
+    source.finish(header.encoding)?;
+    let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
+    let splats = incoming.into_splats(path)?;
+    let flavour = format!("ply {}", header.encoding.name());
+    Ok(Decoded { splats, flavour, comments: header.comments })
+}
+
+/// Indices of the properties of a row.
+struct Layout {
+    mean: [usize; 3],
+    scale: [usize; 3],
+    quat: [usize; 4],
+    opacity: usize,
+    dc: [usize; 3],
+    /// Divisor to [0, 1] where `red green blue` stand in place of `f_dc`.
+    colour_range: Option<f64>,
+    rest: Vec<usize>,
+}
+
+impl Layout {
+    fn of(element: &Element, path: &Path) -> Result<Self> {
+        let mut missing = Vec::new();
+        let mut find = |name: &str| {
+            element.position(name).unwrap_or_else(|| {
+                missing.push(name.to_owned());
+                0
+            })
+        };
+        let mean = ["x", "y", "z"].map(&mut find);
+        let scale = ["scale_0", "scale_1", "scale_2"].map(&mut find);
+        let quat = ["rot_0", "rot_1", "rot_2", "rot_3"].map(&mut find);
+        let opacity = find("opacity");
+        let colours = ["red", "green", "blue"].map(|n| element.position(n));
+        let (dc, colour_range) = match colours {
+            [Some(r), Some(g), Some(b)] if element.position("f_dc_0").is_none() => {
+                let range = match element.properties[r].kind {
+                    Scalar::F32 | Scalar::F64 => 1.0,
+                    Scalar::U16 => 65535.0,
+                    _ => 255.0,
+                };
+                ([r, g, b], Some(range))
+            }
+            _ => (["f_dc_0", "f_dc_1", "f_dc_2"].map(&mut find), None),
+        };
+        if !missing.is_empty() {
+            let what = if missing.len() >= 8 { "; a point cloud or mesh, not splats?" } else { "" };
+            let got = format!("a vertex without {}{what}", missing.join(", "));
+            return Err(Error::format(path, "the properties of a Gaussian splat file", got));
+        }
+        let is_rest = |n: &str| n.strip_prefix("f_rest_").is_some_and(|k| k.parse::<u32>().is_ok());
+        let named = element.properties.iter().filter(|p| is_rest(&p.name)).count();
+        let rest: Vec<usize> =
+            (0..named).map_while(|i| element.position(&format!("f_rest_{i}"))).collect();
+        if !REST_COUNTS.contains(&named) || named != rest.len() {
+            let got = format!("{named}, of which {} in sequence", rest.len());
+            return Err(Error::format(path, "0, 9, 24, 45 or 72 properties f_rest_0, …", got));
+        }
+        Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest })
+    }
+}
+
+fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Result<Incoming> {
+    let layout = Layout::of(element, source.path)?;
+    let mut incoming = Incoming::with_capacity(header.checked_count(element, source)?, 0);
+    let mut rest = vec![0.0f32; layout.rest.len()];
+    header.rows(element, source, |_, v| {
+        for (r, &i) in rest.iter_mut().zip(&layout.rest) {
+            *r = v[i] as f32;
+        }
+        // Degrees that are zero in every row take no memory and no time.
+        incoming.raise_degree(used_degree(&rest));
+        let sh = incoming.push(
+            layout.mean.map(|i| v[i] as f32),
+            layout.quat.map(|i| v[i] as f32),
+            layout.scale.map(|i| v[i].exp() as f32),
+            sigmoid(v[layout.opacity] as f32),
+        );
+        for (h, i) in sh.iter_mut().zip(layout.dc) {
+            *h = match layout.colour_range {
+                None => v[i] as f32,
+                Some(range) => dc_from_colour(v[i] / range),
+            };
+        }
+        rest_to_set(&rest, sh);
+        Ok(())
+    })?;
+    Ok(incoming)
+}
+
+/// Lowest SH degree that holds all of channel-major `f_rest` that is not zero.
+fn used_degree(rest: &[f32]) -> usize {
+    let per_channel = rest.len() / 3;
+    let last = (0..per_channel).rev().find(|j| (0..3).any(|c| rest[c * per_channel + j] != 0.0));
+    last.map_or(0, |j| (j + 1).isqrt())
+}
+
+/// Writes channel-major `f_rest[3, D − 1]` to a set `[D, 3]` after its constant term.
+pub(super) fn rest_to_set(rest: &[f32], set: &mut [f32]) {
+    let per_channel = rest.len() / 3;
+    for (j, h) in set[3..].chunks_exact_mut(3).enumerate() {
+        for (c, v) in h.iter_mut().enumerate() {
+            *v = rest[c * per_channel + j];
+        }
+    }
+}
+
+/// Writes the header and every Gaussian, block by block.
+pub(super) fn write(
+    file: &mut dyn Write,
+    out: &Outgoing,
+    options: &SaveOptions,
+) -> std::io::Result<()> {
+    // Readers assert the 45 values of degree 3, so a lower degree is padded with zeros unless the
+    // caller asks for it.
+    let rests = REST_COUNTS[out.sh_degree.max(options.sh_degree.unwrap_or(3).min(3))];
+    file.write_all(header(out.count, rests, options).as_bytes())?;
+    let mut block = Vec::with_capacity(BLOCK * 4 * (17 + rests));
+    let mut visitor = out.visitor();
+    for (n, i) in out.kept().enumerate() {
+        let g = visitor.at(i)?;
+        let mut put = |v: f32| block.extend_from_slice(&v.to_le_bytes());
+        g.mean.into_iter().chain([0.0; 3]).for_each(&mut put);
+        g.sh[..3].iter().for_each(|v| put(*v));
+        for c in 0..3 {
+            (1..=rests / 3).for_each(|j| put(g.sh[3 * j + c]));
+        }
+        put(logit(g.opacity));
+        g.scale.into_iter().for_each(|s| put(f64::from(s).ln() as f32));
+        g.quat.into_iter().for_each(&mut put);
+        if n % BLOCK == BLOCK - 1 {
+            file.write_all(&block)?;
+            block.clear();
+        }
+    }
+    file.write_all(&block)
+}
+
+/// Returns whether a comment is one of those that every written file begins with. They describe that file
+/// alone, and a copy of the scene gets its own.
+pub fn is_own_comment(comment: &str) -> bool {
+    let version = |text: &str| text.starts_with(|c: char| c.is_ascii_digit());
+    ["axes: ", "units: ", "rot = "].iter().any(|key| comment.starts_with(key))
+        || comment.strip_prefix("subsplat ").is_some_and(version)
+}
+
+fn header(count: usize, rests: usize, options: &SaveOptions) -> String {
+    let axes = match options.up {
+        Up::Keep => "+x right, +y down, +z forward (OpenCV); up is -y",
+        Up::Y => "+x right, +y up, +z backward (OpenGL); up is +y",
+        Up::Z => "+x right, +y forward, +z up; up is +z",
+    };
+    let mut lines = vec![
+        "ply".to_owned(),
+        "format binary_little_endian 1.0".to_owned(),
+        format!("comment subsplat {}", env!("CARGO_PKG_VERSION")),
+        format!("comment axes: {axes}"),
+        "comment units: those of the input poses; scale = ln sigma, opacity = logit".to_owned(),
+        "comment rot = wxyz, world; SH standard 3DGS signs, f_rest channel-major".to_owned(),
+    ];
+    for comment in &options.comments {
+        lines.extend(comment.split(['\n', '\r']).map(|l| format!("comment {l}")));
+    }
+    lines.push(format!("element vertex {count}"));
+    let mut property = |name: &str| lines.push(format!("property float {name}"));
+    for name in ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"] {
+        property(name);
+    }
+    (0..rests).for_each(|i| property(&format!("f_rest_{i}")));
+    for name in ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"] {
+        property(name);
+    }
+    lines.push("end_header\n".to_owned());
+    lines.join("\n")
+}

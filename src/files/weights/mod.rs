@@ -1,0 +1,4 @@
+//! Weights: safetensors, and checkpoints of PyTorch.
+
+pub mod tensors;
+pub mod torch;
