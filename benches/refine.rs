@@ -8,7 +8,7 @@ mod common;
 use anyhow::{Context, Result, ensure};
 use common::scene::{self, SCENES};
 use common::{Bench, Contender, Threads};
-use subsplat::finish::{RefineOptions, Refiner, TargetView};
+use subsplat::finish::{PhaseRun, RefineOptions, TargetView};
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{Renderer, render, slices};
 use subsplat_kernels::cpu::Rasterizer;
@@ -31,7 +31,7 @@ fn main() -> Result<()> {
         let image = Rgb::from_unit(&other, spec.side, spec.side).context("a picture")?;
         let views = [TargetView { camera: &camera, image: &image }];
         let options = RefineOptions::default().with_steps(usize::MAX);
-        let mut checked = Refiner::new(&splats, &views, &raster, &options)?;
+        let mut checked = PhaseRun::new(&splats, &views, &raster, &options)?;
         let mut renderer = Renderer::default();
         bench.on_all(|| {
             let before = checked.error(&mut renderer);
@@ -63,10 +63,10 @@ fn main() -> Result<()> {
             }));
         }
         for threads in [Threads::One, Threads::All] {
-            let mut refiner = Refiner::new(&splats, &views, &raster, &slow)?;
+            let mut phase = PhaseRun::new(&splats, &views, &raster, &slow)?;
             let mut renderer = Renderer::default();
             contenders.push(Contender::new("refinement step", threads, move || {
-                refiner.step(&mut renderer);
+                phase.step(&mut renderer);
                 Ok(())
             }));
         }

@@ -11,7 +11,7 @@
 //! A [`TargetView`] is a picture with its camera. [`fit`] changes [`Splats`] in place.
 
 use super::phase::Phase;
-use super::refiner::{Outcome, Refiner, run};
+use super::phase_run::{Outcome, PhaseRun, run};
 use super::removal::Groups;
 use super::{FinishError, TargetView};
 use crate::scene::render::Renderer;
@@ -96,7 +96,7 @@ pub fn fit(
 ) -> Result<FitReport, FinishError> {
     let phase = Phase::fit(options, has_sharper_start(splats, views));
     let mut groups = Groups::default();
-    let mut step = |refiner: &Refiner<'_>| progress(refiner.steps());
+    let mut step = |phase: &PhaseRun<'_>| progress(phase.steps());
     let Outcome { before, after, .. } =
         run(splats, &mut groups, views, raster, &phase, renderer, &mut step)?;
     Ok(FitReport { before, after })

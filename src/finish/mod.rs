@@ -3,7 +3,7 @@
 //!
 //! An optimisation is one or more phases (`phase`), each a value that says which parameters move
 //! (`parameters`), on which photographs and losses, and when it ends. One optimiser takes the steps of
-//! all phases (`optimiser`), and one loop runs them (`refiner`):
+//! all phases (`optimiser`), and one loop runs them (`phase_run`):
 //!
 //! 1. [`fit()`]: sizes, opacities and colours, on all photographs at once, four steps;
 //! 2. [`refine()`]: means, shapes, opacities and colours, on one photograph after the other, some dozens of
@@ -17,22 +17,22 @@ pub mod merge;
 mod optimiser;
 mod parameters;
 mod phase;
+mod phase_run;
 mod reduce;
 mod refine;
-mod refiner;
 mod removal;
 mod targets;
 
 pub use fit::{FitOptions, FitReport, fit};
+pub use phase_run::PhaseRun;
 pub use reduce::reduce;
 pub use refine::{RefineOptions, RefineReport, refine};
-pub use refiner::Refiner;
 pub use targets::TargetView;
 
 #[cfg(feature = "network")]
-pub(crate) use refine::refine_groups;
+pub(crate) use phase_run::check_time;
 #[cfg(feature = "network")]
-pub(crate) use refiner::check_time;
+pub(crate) use refine::refine_groups;
 #[cfg(feature = "network")]
 pub use removal::Groups;
 #[cfg(feature = "network")]

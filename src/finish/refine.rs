@@ -20,7 +20,7 @@
 //! gives the same bytes on any number of threads, unless [`RefineOptions::time`] limits the steps.
 
 use super::phase::Phase;
-use super::refiner::{Outcome, Refiner, run};
+use super::phase_run::{Outcome, PhaseRun, run};
 use super::removal::{Groups, LEAST_SHARE};
 use super::{FinishError, TargetView};
 use crate::scene::render::Renderer;
@@ -138,7 +138,7 @@ pub struct RefineReport {
 }
 
 /// Refines `splats` on `views` in place. `progress` receives the refinement after each step, whose
-/// [`Refiner::splats`] a caller can show; [`ControlFlow::Break`] cancels. The colour offsets are
+/// [`PhaseRun::splats`] a caller can show; [`ControlFlow::Break`] cancels. The colour offsets are
 /// added to the δ of [`Splats::gain`], which has four numbers a Gaussian afterwards.
 ///
 /// # Errors
@@ -150,7 +150,7 @@ pub fn refine(
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport, FinishError> {
     let mut groups = Groups::equal(splats, views.len(), options.grouped);
     refine_groups(splats, &mut groups, views, raster, options, renderer, progress)
@@ -167,7 +167,7 @@ pub(crate) fn refine_groups(
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport, FinishError> {
     let phase = Phase::refine(options);
     let Outcome { steps, before, after, removed } =

@@ -2,6 +2,7 @@
 
 use super::FinishError;
 use super::loss::{Scored, dssim, mse};
+use super::phase::LossWeights;
 use crate::scene::pictures::Rgb;
 use crate::scene::splats::Splats;
 use glam::{Vec2, Vec3};
@@ -27,7 +28,7 @@ pub(super) struct Target<'a> {
     pub camera: &'a Camera,
     /// `[3, H, W]`.
     pub truth: Vec<f32>,
-    dssim: f64,
+    weights: LossWeights,
 }
 
 impl<'a> Target<'a> {
@@ -42,13 +43,17 @@ impl<'a> Target<'a> {
         Ok(())
     }
 
-    /// Converts a picture to planes. `dssim` is the weight of (1 − SSIM)/2 in the loss.
+    /// Converts a picture to planes.
     ///
     /// # Errors
     /// Those of [`Target::check`].
-    pub fn new(index: usize, view: &TargetView<'a>, dssim: f64) -> Result<Self, FinishError> {
+    pub fn new(
+        index: usize,
+        view: &TargetView<'a>,
+        weights: LossWeights,
+    ) -> Result<Self, FinishError> {
         Self::check(index, view)?;
-        Ok(Self { camera: view.camera, truth: view.image.to_planes(), dssim })
+        Ok(Self { camera: view.camera, truth: view.image.to_planes(), weights })
     }
 
     /// The loss of rendered planes `[5, H, W]`, with its gradient by R, G and B.
@@ -61,8 +66,8 @@ impl<'a> Target<'a> {
         let k = self.camera.intrinsics();
         let rgb = &planes[..truth.len()];
         let mut loss = mse(rgb, truth);
-        if self.dssim > 0.0 {
-            loss.add(&dssim(rgb, truth, k.width, k.height), self.dssim);
+        if self.weights.dssim > 0.0 {
+            loss.add(&dssim(rgb, truth, k.width, k.height), self.weights.dssim);
         }
         loss
     }

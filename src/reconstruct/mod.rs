@@ -40,10 +40,10 @@ mod children;
 mod density;
 mod depth_range;
 mod detail;
+mod equal_exposure;
 mod error;
 mod estimate_cameras;
-mod exposure;
-mod fit;
+mod finishing;
 mod input_size;
 pub mod inputs;
 mod options;
@@ -74,15 +74,15 @@ pub use reconstructor::Reconstructor;
 pub use warning::Warning;
 
 pub(crate) use children::{SceneChildren, counts_of};
-pub(crate) use fit::{check_refine, fit_to_inputs, refine_on_inputs};
+pub(crate) use finishing::{check_refine, fit_to_inputs, refine_on_inputs};
 pub(crate) use poses::check_pairs;
 
 /// The stages of a run, one by one, for evaluation. No version promises anything about them.
 pub mod stages {
     pub use super::children::{Counts, SceneChildren, counts_of};
     pub use super::detail::add_detail;
-    pub use super::exposure::equalise;
-    pub use super::fit::{fit_to_inputs, refine_on_inputs};
+    pub use super::equal_exposure::equalise;
+    pub use super::finishing::{fit_to_inputs, refine_on_inputs};
     pub use super::poses::{adjusted, check_pairs, located};
     pub use crate::finish::Groups;
 }

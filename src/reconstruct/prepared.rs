@@ -7,7 +7,7 @@ use super::{
 };
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
-use crate::finish::Refiner;
+use crate::finish::PhaseRun;
 use crate::network::model::Views;
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::scene::pictures::{Depth, Rgb};
@@ -138,7 +138,7 @@ impl Prepared<'_> {
         if refine_options.steps > 0 {
             tracker.begin(Stage::Refine, progress)?;
             let mut part = tracker.parts(progress);
-            let mut step = |refiner: &Refiner<'_>| part(refiner.progress());
+            let mut step = |phase: &PhaseRun<'_>| part(phase.progress());
             let (raster, how) = (&raster_options, &refine_options);
             let (splats, groups) = (&mut splats, &mut groups);
             let done =

@@ -4,7 +4,7 @@ use super::{DepthBounds, Detail, Refine, Result, StageTime, Warning, refine_on_i
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
 use crate::files::{SaveOptions, SaveReport, save_splats};
-use crate::finish::{FitReport, Groups, RefineReport, Refiner};
+use crate::finish::{FitReport, Groups, PhaseRun, RefineReport};
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::scene::pictures::Depth;
 use crate::scene::render::{Picture, Renderer, comment_of_camera, comment_of_options, render};
@@ -73,7 +73,7 @@ impl Reconstruction {
 
     /// Refines the Gaussians on the photographs, as [`Options::refine`](super::Options::refine) does
     /// within a run, for a caller that shows the scene first. `progress` receives the refinement
-    /// after each step; [`Refiner::splats`] returns the Gaussians so far.
+    /// after each step; [`PhaseRun::splats`] returns the Gaussians so far.
     ///
     /// # Errors
     /// [`Error::Cancelled`](super::Error::Cancelled); the Gaussians are then unchanged.
@@ -81,7 +81,7 @@ impl Reconstruction {
         &mut self,
         refine: Refine,
         renderer: &mut Renderer,
-        progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+        progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
     ) -> Result<RefineReport> {
         let Self { splats, groups, inputs, raster_options, fit, .. } = self;
         let options = refine.options_for(inputs.len(), splats.len(), fit.is_some());

@@ -5,7 +5,7 @@ use super::warning::Warning;
 use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, EstimateOptions, Options, Photo,
     Photographs, Poses, Prepared, Progress, Reconstruction, Refine, Result, Stage, check_pairs,
-    check_refine, estimate_cameras, exposure, is_mvsplat, poses,
+    check_refine, equal_exposure, estimate_cameras, is_mvsplat, poses,
 };
 use crate::network::config::{Config, Preset};
 use crate::network::model::subsplat::SubSplat;
@@ -209,7 +209,7 @@ impl Reconstructor {
                 check_pairs(photos, |part| tracker.advance(part, progress))?
             }
         };
-        let corrected = exposure::equalise(photos, &mut inputs, &reports);
+        let corrected = equal_exposure::equalise(photos, &mut inputs, &reports);
         tracker.close();
         if options.check == Check::Refuse {
             poses::refuse_bad(&reports)?;

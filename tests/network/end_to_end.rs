@@ -185,8 +185,8 @@ fn paper_pictures_turn_with_the_world_but_for_mvsplats_colour_quirk() {
             eprintln!("mvsplat {mvsplat}: alpha {alpha:.1e}, degree 0 {flat:.1}, all {full:.1} dB");
             assert!(alpha < 1e-3, "alpha differs by {alpha:.1e}");
             assert!(flat > 60.0, "{flat:.1} dB");
-            // MVSplat turns coefficients in e3nn's basis and evaluates them in another
-            // (mvsplat.md, quirk c): its view-dependent colour is tied to the world.
+            // MVSplat turns coefficients in e3nn's basis and evaluates them in INRIA's,
+            // and its view-dependent colour is tied to the world.
             assert_eq!(full > 60.0, !mvsplat, "{full:.1} dB");
         }
     }

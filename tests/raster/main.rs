@@ -2,12 +2,9 @@
 
 mod baseline;
 mod coverage;
-mod fit;
 mod levels;
 mod raster;
 mod raster_bwd;
 mod raster_bwd_oracle;
 mod raster_op;
 mod raster_oracle;
-mod reduce;
-mod refine;

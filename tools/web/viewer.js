@@ -5,13 +5,13 @@
 //
 // World axes here are those of .spz: x right, y up, z backward. Camera axes are OpenCV's: x right,
 // y down, z forward. Projection, low-pass and blending are the crate's `standard` convention
-// (kernels/src/cpu/raster/ewa.rs, kernels/src/layout/mod.rs); the movements are those of src/navigation.rs.
+// (kernels/src/cpu/raster/ewa.rs, kernels/src/layout/mod.rs); the movements are those of src/scene/navigation.rs.
 "use strict";
 
 const ALPHA_MIN = 1 / 255;
 const ALPHA_MAX = 0.999;
 const SH_C0 = 0.28209479177387814;
-/** The rules of src/levels.rs and src/finish/merge.rs. */
+/** The rules of src/scene/levels.rs and src/finish/merge.rs. */
 const BLOCK = 1024, CELL_PX = 1, SIGMA_MAX = 1, SHARE_MAX = 0.5, PIXEL_SIDES = 1.4, LOWPASS = 0.3;
 const MERGED_OPACITY_MAX = 0.9999, DENSE_OPACITY = 0.35;
 /** Bits of a coordinate on the curve: a code is a whole number below 2 to the power of 53. */
@@ -258,7 +258,7 @@ function slices(goesOn) {
 }
 
 /**
- * Level of detail, as src/levels.rs describes it. Merged Gaussians follow those of the file in `scene`.
+ * Level of detail, as src/scene/levels.rs describes it. Merged Gaussians follow those of the file in `scene`.
  * A block has a bounding sphere, its Gaussians `own`, and levels `coarse` of `count` merged Gaussians.
  */
 class Levels {

@@ -14,7 +14,7 @@
 //!
 //! Logarithms clamp α to 0.9999. Each lane of a vector ([`super::simd`]) is a parent, so
 //! that a sum over children is a loop. WGSL: wgsl/spgr/redistribute.wgsl,
-//! kernels/src/gpu/redistribute.rs. Op: ops/redistribute.rs.
+//! kernels/src/gpu/spgr/redistribute.rs. Op: ops/redistribute.rs.
 
 use super::simd::{LANES, Mask, Real, RowLayout, Vector, VectorKernel};
 use super::uninit::{UninitBuffer, UninitSlice, zeroed};

@@ -1,7 +1,7 @@
 //! SplitMix64's arithmetic, from which all seeded random numbers derive: equal on every machine.
 //!
 //! Source: Steele, Lea and Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.
-//! WGSL: `kernels/shared/wide.wgsl`.
+//! WGSL: `kernels/wgsl/shared/wide.wgsl`.
 
 /// Increment of SplitMix64's state: 2⁶⁴ over the golden ratio, odd.
 pub const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;

@@ -1,6 +1,5 @@
-//! Inputs of a reconstruction: crops, context pairs, exposure, depth range and input size.
+//! Inputs of a reconstruction: crops, context pairs, and the exposure of two pictures.
 
 pub mod crop;
-
 pub mod exposure;
 pub mod pair;

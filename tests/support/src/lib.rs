@@ -6,6 +6,7 @@ pub mod chunk_files;
 pub mod colmap_files;
 pub mod cpu_against_gpu;
 pub mod edit;
+pub mod finite_differences;
 pub mod fit_scene;
 pub mod gather;
 pub mod gpu;

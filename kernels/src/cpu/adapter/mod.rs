@@ -11,7 +11,7 @@
 //! α   = ½(1 − (1 − p)^e + p^{1/e})/G,   p/G for e = 1
 //! ```
 //! The lanes of a vector are neighbouring pixels of a row. Op: ops/adapter.rs. Reference in
-//! tensor operations: model/primaries_ref.rs. Tests: ops/adapter.rs, tests/network/primaries.rs.
+//! tensor operations: tests/support/src/primaries_reference.rs. Tests: ops/adapter.rs, tests/network/primaries.rs.
 
 mod backward;
 pub mod colour;

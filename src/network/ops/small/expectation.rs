@@ -64,7 +64,7 @@ pub fn add_scores(logits: &Tensor, scores: &Tensor, factor: &Tensor) -> Result<T
     logits.contiguous()?.apply_op3(&scores.contiguous()?, factor, AddScores)
 }
 
-/// Gain of the scores in [`add_scores`]: they count fourfold (`learning.md`'s network).
+/// Gain of the scores in [`add_scores`]: the network was trained with fourfold scores.
 pub(in crate::network::ops) const SCORE_GAIN: f32 = 4.0;
 /// Elements per task.
 const CHUNK: usize = 16_384;

@@ -4,7 +4,7 @@ use super::Method;
 use super::evaluator::{Crops, Options};
 use super::methods::{enlarged, mean, nearest};
 use std::ops::ControlFlow;
-use subsplat::finish::{FitOptions, Refiner};
+use subsplat::finish::{FitOptions, PhaseRun};
 use subsplat::network::config::LowpassRef;
 use subsplat::network::model::scene_encoding::SceneEncoding;
 use subsplat::network::model::subsplat::feature_channels;
@@ -209,7 +209,7 @@ impl<'a> PictureMaker<'a> {
                     let SceneChildren { splats, groups, .. } = &mut children;
                     let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
                     let (raster, how) = (&raster, &options);
-                    let mut progress = |_: &Refiner<'_>| ControlFlow::Continue(());
+                    let mut progress = |_: &PhaseRun<'_>| ControlFlow::Continue(());
                     refine_on_inputs(splats, groups, inputs, raster, how, renderer, &mut progress)?;
                 }
             }

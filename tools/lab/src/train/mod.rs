@@ -3,7 +3,7 @@
 //! A training is a function of its configuration ([`TrainConfig`]). The initial weights, the
 //! examples and their order derive from seeds, and every kernel gives the same bytes for any number
 //! of threads. A checkpoint therefore holds the parameters, the optimizer's state and the step. A
-//! resumed training takes the same steps as an uninterrupted one (`tools/cli/tests/cli/train.rs`).
+//! resumed training takes the same steps as an uninterrupted one (`tools/lab/tests/cli/train.rs`).
 //! Several processes that share a training take these steps too ([`ranks`]).
 
 pub mod augment;

@@ -7,7 +7,6 @@ use candle_core::{Device, Tensor, Var};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use subsplat::network::model::weights::Weights;
-use subsplat::scene::metrics;
 use subsplat::scene::pictures::Rgb;
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 use subsplat_kernels::layout::{HEAD_GEOMETRY_LEN, HEAD_LOG_SCALE_OFFSET};
@@ -23,62 +22,7 @@ use subsplat_lab::train::ranks::{Division, Ranks};
 use subsplat_lab::train::schedule::{NamedWarmup, Schedule, Warmup};
 use subsplat_lab::train::source::{Example, ExampleSize, InputTargets, Replay, Rooms, Source};
 use subsplat_lab::train::step::{Learner, Seconds, StepScale};
-
-/// Returns reproducible numbers in [0, 1).
-fn noise(n: usize, seed: u32) -> Vec<f32> {
-    let mut s = seed.wrapping_mul(747_796_405).wrapping_add(1);
-    let mut next = || {
-        s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-        (s >> 8) as f32 / (1 << 24) as f32
-    };
-    (0..n).map(|_| next()).collect()
-}
-
-/// Compares the gradient of `f` at `x` with central differences of its value, which is f64.
-fn check_gradient(x: &[f32], h: f32, tolerance: f64, f: impl Fn(&[f32]) -> Scored) {
-    let gradient = f(x).gradient;
-    let largest = gradient.iter().fold(0f32, |a, g| a.max(g.abs()));
-    assert!(largest > 0.0);
-    for i in (0..x.len()).step_by(1 + x.len() / 41) {
-        let at = |d: f32| {
-            let mut x = x.to_vec();
-            x[i] += d;
-            (f64::from(x[i]), f(&x).value)
-        };
-        let ((a, low), (b, high)) = (at(-h), at(h));
-        let numeric = (high - low) / (b - a);
-        let off = (numeric - f64::from(gradient[i])).abs();
-        assert!(off < tolerance * f64::from(largest), "[{i}]: {numeric} and {}", gradient[i]);
-    }
-}
-
-#[test]
-fn mse_follows_its_formula() {
-    let (x, t) = (noise(300, 1), noise(300, 2));
-    let want: f64 = x.iter().zip(&t).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / 300.0;
-    assert!((loss::mse(&x, &t).value - want).abs() < 1e-9);
-    check_gradient(&x, 1e-2, 1e-3, |x| loss::mse(x, &t));
-}
-
-#[test]
-fn dssim_equals_the_metric_and_has_its_gradient() {
-    let (w, h) = (23, 17);
-    let (x, t) = (noise(3 * w * h, 3), noise(3 * w * h, 4));
-    // A target and a perturbed copy: SSIM far from 0.
-    let x: Vec<f32> = x.iter().zip(&t).map(|(x, t)| 0.3 * x + 0.7 * t).collect();
-    let inner = |p: &[f32]| -> Vec<f32> {
-        (0..w * h)
-            .flat_map(|i| (0..3).map(move |c| (c, i)))
-            .map(|(c, i)| p[c * w * h + i])
-            .collect()
-    };
-    let ssim = metrics::ssim(&inner(&x), &inner(&t), w, h).unwrap();
-    let found = loss::dssim(&x, &t, w, h);
-    assert!((found.value - 0.5 * (1.0 - ssim)).abs() < 1e-5, "{} {ssim}", found.value);
-    check_gradient(&x, 1e-2, 2e-2, |x| loss::dssim(x, &t, w, h));
-    // Too small for one window.
-    assert_eq!(loss::dssim(&x[..300], &t[..300], 10, 10), Scored::zero(300));
-}
+use subsplat_test_support::finite_differences::{check_gradient, noise};
 
 #[test]
 fn cross_entropy_weights_candidates_by_distance() {

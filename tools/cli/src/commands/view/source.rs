@@ -13,7 +13,7 @@ use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use subsplat::files::{SplatFormat, load_with_comments};
-use subsplat::finish::Refiner;
+use subsplat::finish::PhaseRun;
 use subsplat::scene::navigation::{Start, up_of};
 use subsplat::scene::render::camera_of_comments;
 use subsplat::scene::splats::Splats;
@@ -244,9 +244,9 @@ impl Unrefined {
         let options = self.options;
         let upscale = Some(self.upscale);
         let (mut shown, mut failure) = (Instant::now(), None);
-        let mut progress = |refiner: &Refiner<'_>| {
+        let mut progress = |phase: &PhaseRun<'_>| {
             if shown.elapsed() >= SHOWN_EVERY {
-                failure = show(Made { splats: refiner.splats(), options, upscale }).err();
+                failure = show(Made { splats: phase.splats(), options, upscale }).err();
                 shown = Instant::now();
             }
             match failure {

@@ -4,7 +4,7 @@
 use glam::Mat4;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
-use subsplat::finish::{RefineOptions, RefineReport, Refiner, refine};
+use subsplat::finish::{PhaseRun, RefineOptions, RefineReport, refine};
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render;
 use subsplat::{Camera, FinishError, RasterOptions, Renderer, Splats, TargetView};
@@ -117,7 +117,7 @@ fn a_cancelled_refinement_changes_nothing() {
     let before = splats.clone();
     let views = [TargetView { camera: &cameras[0], image: &truth[0] }];
     let (raster, options) = (RasterOptions::default(), RefineOptions::default());
-    let mut stop = |refiner: &Refiner<'_>| match refiner.steps() {
+    let mut stop = |phase: &PhaseRun<'_>| match phase.steps() {
         2 => ControlFlow::Break(()),
         _ => ControlFlow::Continue(()),
     };
@@ -133,7 +133,7 @@ fn a_picture_of_another_size_is_refused() {
     let image = Rgb { width: 2, height: 1, data: vec![0; 6] };
     let views = [TargetView { camera: &cameras[0], image: &image }];
     let options = RefineOptions::default();
-    let error = Refiner::new(&splats, &views, &RasterOptions::default(), &options).err().unwrap();
+    let error = PhaseRun::new(&splats, &views, &RasterOptions::default(), &options).err().unwrap();
     assert_eq!(error.to_string(), "view 0: expected a picture of 48x48, got 2x1");
 }
 
@@ -172,7 +172,7 @@ fn gaussians_at_the_edge_of_both_photographs_keep_their_geometry() {
     let views: Vec<TargetView<'_>> =
         order.iter().zip(truth).map(|(camera, image)| TargetView { camera, image }).collect();
     let (raster, options) = (RasterOptions::default(), RefineOptions::default().with_steps(60));
-    let mut go_on = |_: &Refiner<'_>| ControlFlow::Continue(());
+    let mut go_on = |_: &PhaseRun<'_>| ControlFlow::Continue(());
     let mut splats = start.clone();
     let mut renderer = Renderer::default();
     refine(&mut splats, &views, &raster, &options, &mut renderer, &mut go_on).unwrap();
@@ -265,7 +265,7 @@ fn parents_that_no_photograph_shows_are_removed() {
         let options = RefineOptions::default().with_steps(90).with_groups(true);
         let options = options.with_least_share(share);
         let (mut splats, mut renderer) = (start.clone(), Renderer::default());
-        let mut go_on = |_: &Refiner<'_>| ControlFlow::Continue(());
+        let mut go_on = |_: &PhaseRun<'_>| ControlFlow::Continue(());
         let raster = RasterOptions::default();
         let report =
             refine(&mut splats, &views, &raster, &options, &mut renderer, &mut go_on).unwrap();

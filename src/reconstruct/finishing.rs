@@ -2,7 +2,7 @@
 
 use super::{Error, Refine, Result};
 use crate::finish::{
-    FinishError, FitOptions, FitReport, Groups, RefineOptions, RefineReport, Refiner, TargetView,
+    FinishError, FitOptions, FitReport, Groups, PhaseRun, RefineOptions, RefineReport, TargetView,
     check_time, fit, refine_groups,
 };
 use crate::reconstruct::inputs::crop::Cropped;
@@ -52,7 +52,7 @@ pub fn refine_on_inputs(
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport> {
     refine_groups(splats, groups, &views_of(inputs), raster, options, renderer, progress)
         .map_err(error)

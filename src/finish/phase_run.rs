@@ -19,7 +19,7 @@ use subsplat_kernels::layout::{
 
 /// A phase that goes on step by step, for callers that show it. [`fit`](super::fit()) and
 /// [`refine`](super::refine()) run whole ones.
-pub struct Refiner<'a> {
+pub struct PhaseRun<'a> {
     phase: Phase,
     targets: Vec<Target<'a>>,
     raster: RasterOptions,
@@ -54,7 +54,7 @@ impl Outcome {
     }
 }
 
-impl<'a> Refiner<'a> {
+impl<'a> PhaseRun<'a> {
     /// Prepares a refinement of `splats` on `views`, which are rendered by the rules `raster` in
     /// the splats' own SH basis.
     ///
@@ -79,7 +79,7 @@ impl<'a> Refiner<'a> {
         phase: &Phase,
     ) -> Result<Self, FinishError> {
         check_time(phase.time, HAS_CLOCK)?;
-        let target = |(i, view): (usize, &TargetView<'a>)| Target::new(i, view, phase.loss.dssim);
+        let target = |(i, view): (usize, &TargetView<'a>)| Target::new(i, view, phase.loss);
         let targets = views.iter().enumerate().map(target).collect::<Result<_, _>>()?;
         let pixels = if phase.moves(MEAN) { pixel_sizes(splats, views) } else { Vec::new() };
         let spares = phase.spares_edges && views.len() == 2;
@@ -188,7 +188,7 @@ impl<'a> Refiner<'a> {
         error
     }
 
-    /// [`Refiner::error`], and the mean share of the photographs on which it was measured.
+    /// [`PhaseRun::error`], and the mean share of the photographs on which it was measured.
     fn measure(&self, renderer: &mut Renderer) -> [f64; 2] {
         let mut sum = [0.0; 2];
         for (view, target) in self.targets.iter().enumerate() {
@@ -256,7 +256,7 @@ pub(super) fn run(
     raster: &RasterOptions,
     phase: &Phase,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
 ) -> Result<Outcome, FinishError> {
     check_time(phase.time, HAS_CLOCK)?;
     for (i, view) in views.iter().enumerate() {
@@ -270,37 +270,37 @@ pub(super) fn run(
         Some((kept, groups)) => (kept, groups),
         None => (&*splats, &*groups),
     };
-    let mut refiner = Refiner::of_phase(kept, kept_groups.clone(), views, raster, phase)?;
-    let [before, covered] = refiner.measure(renderer);
+    let mut phase_run = PhaseRun::of_phase(kept, kept_groups.clone(), views, raster, phase)?;
+    let [before, covered] = phase_run.measure(renderer);
     if views.len() == 2 && covered < phase.least_covered {
         return Ok(Outcome::unchanged(0, before));
     }
-    refiner.choose_start(before, renderer);
+    phase_run.choose_start(before, renderer);
     let mut last = None;
-    while !refiner.is_done() {
-        refiner.step(renderer);
-        if progress(&refiner).is_break() {
+    while !phase_run.is_done() {
+        phase_run.step(renderer);
+        if progress(&phase_run).is_break() {
             return Err(FinishError::Cancelled);
         }
         let Some(patience) = phase.patience else { continue };
         let between = patience.rounds * views.len();
         // High rates at the beginning can raise the error for a while.
-        let settled = refiner.progress() >= 0.5 && refiner.steps() + between < phase.steps;
-        if settled && refiner.steps().is_multiple_of(between) {
-            let error = refiner.error(renderer);
+        let settled = phase_run.progress() >= 0.5 && phase_run.steps() + between < phase.steps;
+        if settled && phase_run.steps().is_multiple_of(between) {
+            let error = phase_run.error(renderer);
             if last.is_some_and(|last| !(error < last * (1.0 - patience.least_gain))) {
                 break;
             }
             last = Some(error);
         }
     }
-    let steps = refiner.steps();
-    let after = refiner.error(renderer);
+    let steps = phase_run.steps();
+    let after = phase_run.error(renderer);
     // An error that is not a number fails the comparison as well.
     if !(after < before) {
         return Ok(Outcome::unchanged(steps, before));
     }
-    let (rows, gain) = refiner.optimiser.into_parts();
+    let (rows, gain) = phase_run.optimiser.into_parts();
     let removed = splats.len() - rows.len() / SPLAT_STRIDE;
     if let Some((kept, kept_groups)) = pruned {
         (*splats, *groups) = (kept, kept_groups);

@@ -1,0 +1,6 @@
+//! The optimiser of a scene on its photographs, its losses, and the merging of Gaussians.
+
+mod fit;
+mod loss;
+mod reduce;
+mod refine;
