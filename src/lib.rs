@@ -12,7 +12,7 @@
 //! let scene = load_scene("examples/room")?;
 //! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
 //! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
-//! let model = Reconstructor::shipped(2)?; // or ::load(weights)
+//! let model = Reconstructor::shipped(2)?; // or ::load("weights.safetensors", None)
 //! let room = model.run(&photos, &options)?;
 //! let picture = room.render(&scene.frames[2].camera); // any camera
 //! assert_eq!((picture.width, picture.height, room.splats().len()), (512, 512, 524_288));
@@ -56,7 +56,7 @@
 //!   gradients.
 //! * [`load_scene`], [`load_splats`] and [`save_splats`] read and write files.
 //! * `estimate_cameras` and `estimate_cameras_of_files` estimate the cameras of photographs that
-//!   have none, in memory and in files; the module `estimate` holds their options and results.
+//!   have none, in memory and in files; the module `cameras::estimation` holds options and results of the poses.
 //! * The modules hold reports, options and types that are seldom named: [`scene`], [`files`], [`cameras`],
 //!   [`finish`], `reconstruct`. The modules `network` and [`kernels`] carry no promise between versions.
 //! * [`Camera`] and [`Intrinsics`] define all geometric conventions: OpenCV axes, pixel centres

@@ -1,6 +1,6 @@
 //! Time for reports. WebAssembly without an operating system has no clock: durations are 0 there.
 
-/// Whether there is a clock, without which durations limit nothing.
+/// True if the platform has a clock. Without one, limits of time have no effect.
 pub const HAS_CLOCK: bool = !cfg!(all(target_family = "wasm", target_os = "unknown"));
 
 #[cfg(not(all(target_family = "wasm", target_os = "unknown")))]

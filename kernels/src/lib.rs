@@ -6,7 +6,8 @@
 //! * [`camera`]: the pinhole camera, which defines all geometric conventions.
 //!
 //! The crate `subsplat` is the interface for applications. This crate carries no promise between
-//! versions. It is the only crate of the project with `unsafe` code.
+//! versions. The crate `subsplat` has no `unsafe` code; of the
+//! programs, only the allocator and the browser module have it.
 
 pub mod backend;
 pub mod camera;

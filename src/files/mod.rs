@@ -1,12 +1,12 @@
 //! Readers and writers of every file format. Readers convert to the conventions of
-//! `camera.rs`; writers convert from them.
+//! [`subsplat_kernels::camera`]; writers convert from them.
 //!
 //! Writers write a temporary file and rename it at the end ([`write_atomic`]), so that no
 //! reader sees a partial file. Readers compare every declared size with the bytes that
 //! exist before they allocate. They check the checksums of a container and refuse bytes
 //! after its end.
 //!
-//! Foreign conventions end here and in the network's `primaries.rs`. Every binary reader has a `parse_*` of
+//! Foreign conventions end here and in the network's `model/primaries.rs`. Every binary reader has a `parse_*` of
 //! bytes, which tests and fuzz targets call.
 
 pub mod photos;

@@ -27,7 +27,7 @@ pub(super) enum Buffer {
     Gain,
 }
 
-/// How an element v of a parameter changes a number of a Gaussian. The elements begin at 0, a logit at
+/// Formula by which an element v of a parameter changes a number of a Gaussian. The elements begin at 0, a logit at
 /// the logit of its number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Form {
@@ -52,7 +52,7 @@ pub(super) struct Parameter {
     pub buffer: Buffer,
     /// Offset of the first of them in the Gaussian's part of the buffer.
     pub first: usize,
-    /// How it changes them.
+    /// Formula of the change.
     pub form: Form,
 }
 

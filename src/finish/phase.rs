@@ -110,7 +110,7 @@ pub(super) struct LossWeights {
     pub across: f32,
 }
 
-/// What tells whether a phase has improved the Gaussians.
+/// Measure that decides whether a phase improved the Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Measure {
     /// The mean loss of the photographs.
@@ -120,7 +120,7 @@ pub(super) enum Measure {
     Others,
 }
 
-/// When steps end before their limit.
+/// Rule that ends the steps before their limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Patience {
     /// Rounds of all photographs between two measurements, in the second half.
@@ -149,9 +149,9 @@ pub(super) struct Phase {
     pub steps: usize,
     /// Longest duration of the steps; the rates then fall over it.
     pub time: Option<Duration>,
-    /// When steps end before that.
+    /// Rule that ends the steps earlier.
     pub patience: Option<Patience>,
-    /// What tells whether the result is kept.
+    /// Measure that decides whether the result is kept.
     pub measure: Measure,
     /// Of two photographs, only the colours of Gaussians move that reach beyond both.
     pub spares_edges: bool,

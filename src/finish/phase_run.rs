@@ -34,7 +34,7 @@ pub struct PhaseRun<'a> {
     step: usize,
 }
 
-/// What a phase did.
+/// Result of a phase.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Outcome {
     /// Steps that were taken.

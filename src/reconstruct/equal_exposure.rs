@@ -91,7 +91,7 @@ fn middle(to_first: &[Tone]) -> usize {
     low.min(high)
 }
 
-/// Whether a correction is large, and removes most of the difference.
+/// Returns whether a correction is large and removes most of the difference.
 fn is_worth(exposure: &Exposure) -> bool {
     let grey = |c: usize| (exposure.gain[c] * 128.0 + exposure.offset[c] - 128.0).abs();
     let large = (0..3).any(|c| grey(c) >= MIN_LEVELS);

@@ -45,7 +45,9 @@ impl fmt::Display for LensSource {
         match self {
             Self::Given => f.write_str("as given"),
             Self::Exif(source) => write!(f, "from EXIF ({source})"),
-            Self::Assumed => f.write_str("not known; 0.75 of the longer side as a start"),
+            Self::Assumed => {
+                f.write_str("not stated: estimated from a start of 0.75 of the longer side")
+            }
         }
     }
 }
@@ -185,7 +187,7 @@ fn estimate_scene(
     Ok(EstimatedScene { scene, estimate, lenses })
 }
 
-/// What is known of a photograph's lens.
+/// Returns the known part of a photograph's lens, and its source.
 fn lens(photograph: &Photograph, known: Option<KnownLens>) -> (Lens, LensSource) {
     let (w, h) = (photograph.image.width, photograph.image.height);
     match (known, photograph.camera.focal) {

@@ -88,7 +88,7 @@ impl InputSize {
 /// A size with its rank; the higher the better.
 struct Candidate {
     size: Size,
-    /// Whether the area is in range, share kept of the photograph that loses most, mean share,
+    /// True if the area is in range; share kept of the photograph that loses most, mean share,
     /// closeness of the area. Shares are in ppm, so that rounding decides nothing.
     rank: (bool, i64, i64, i64),
 }

@@ -61,7 +61,7 @@ impl Stage {
         }
     }
 
-    /// What happens to the picture in this stage, for people: `cropping the photographs`, ….
+    /// Description of the stage for people: `cropping the photographs`, ….
     pub fn description(self) -> &'static str {
         match self {
             Self::Poses => "adjusting the cameras",

@@ -81,7 +81,7 @@ impl fmt::Display for Warning {
                 f,
                 "the nearest and the farthest distance of the scene, {near:.4} and {far:.4}, are \
                  guessed from the distance between the cameras, so that shapes may be wrong; give \
-                 both distances if you know them"
+                 --near and --far if you know them"
             ),
             Self::InputSizeCut { requested, used, stride } => write!(
                 f,

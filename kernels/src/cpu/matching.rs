@@ -74,7 +74,7 @@ fn pool(plane: &[f32], height: usize, width: usize, step: usize) -> Vec<f32> {
     out
 }
 
-/// Where the pixels of one picture land in another for a plane at constant
+/// Map from the pixels of one picture to those of another for a plane at constant
 /// reference depth: homogeneous source pixel = `from_px`·(u, v, 1) + disparity·`shift`.
 #[derive(Clone, Copy, Debug)]
 pub struct PlaneWarp {

@@ -1,7 +1,7 @@
 //! CPU kernels: plain `f32` slices in and out, rayon for threads, no tensors.
 //!
 //! Kernels trust their callers (the crate `subsplat` checks shapes and dtypes) and do not
-//! fail. This is the only module where `unsafe` may appear.
+//! fail. This is the only module of this crate where `unsafe` may appear.
 //!
 //! One file or folder per kernel; [`raster`] is the rasterizer.
 

@@ -59,7 +59,7 @@ pub(super) enum Accuracy {
     Wrong,
 }
 
-/// How well the cameras explain the consistent matches.
+/// Agreement of the cameras with the consistent matches.
 pub(super) struct Agreement {
     /// Accuracy of the cameras.
     pub accuracy: Accuracy,

@@ -47,7 +47,7 @@ impl PoseOptions {
     }
 }
 
-/// How far an estimate is to be trusted.
+/// Reliability of an estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Confidence {
     /// The matches determine the cameras.
@@ -129,7 +129,7 @@ pub enum PoseWarning {
     Forced(PoseRefusal),
 }
 
-/// Why photographs get no cameras.
+/// Reason for which photographs get no cameras.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PoseRefusal {

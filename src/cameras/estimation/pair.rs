@@ -51,7 +51,7 @@ pub(super) struct PairEstimate {
     pub matches: usize,
     /// Number of those that agree with the pose. Matches found along its lines prove nothing.
     pub consistent: usize,
-    /// Whether the focal length was free.
+    /// True if the focal length was free.
     pub free_focal: bool,
     /// Support of the best other pose over that of this one; 0 without another.
     pub rival: f64,

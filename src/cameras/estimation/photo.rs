@@ -19,7 +19,7 @@ const UNKNOWN_DEVIATION: f64 = 0.35;
 /// millimetres of the 35 mm format, and changed a little by the focus.
 const STATED_DEVIATION: f64 = 0.03;
 
-/// What is known of a photograph's lens: a pinhole camera, and how exact its focal length is.
+/// Lens of a photograph: a pinhole camera, and the uncertainty of its focal length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lens {
     /// The intrinsics as far as they are known, px of the photograph.
@@ -54,7 +54,7 @@ impl Lens {
     }
 }
 
-/// Why a photograph cannot be used.
+/// Reason for which a photograph cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PosePhotoError {

@@ -1,7 +1,7 @@
 //! Points matched between photographs, without any knowledge of the cameras.
 //!
 //! Input: grey pictures ([`GrayImage`]). Output: features (`features::detect`) and matched pairs of
-//! them (`pairs::pairs`). `check` compares cameras with the matches; `poses` estimates cameras
+//! them (`pairs::pairs`). `check` compares cameras with the matches; `estimation` estimates cameras
 //! from them. Equal inputs give equal results.
 //!
 //! `kornia-3d` and `kornia-imgproc` 0.2 were measured on the pairs that chose our thresholds: area under the curve at 5° 0.64 (ours

@@ -44,7 +44,7 @@ pub enum LrFrom {
 /// Largest side of a picture, px: beyond every use, and no product of sides overflows.
 const SIDE_MAX: usize = 1 << 15;
 
-/// How to crop.
+/// Options of a crop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CropOptions {
     /// Size of the network's input.
@@ -79,7 +79,7 @@ impl CropOptions {
     }
 }
 
-/// Where a picture lies in the photograph: photo px = origin + scale · picture px.
+/// Position of a picture in its photograph: photo px = origin + scale · picture px.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PhotoWindow {
     /// Photograph pixels per picture pixel.
@@ -106,7 +106,7 @@ pub struct Cropped {
     pub target: Rgb,
     /// Camera of `target`.
     pub target_camera: Camera,
-    /// Where `target` lies in the photograph.
+    /// Position of `target` in the photograph.
     pub window: PhotoWindow,
 }
 

@@ -5,7 +5,7 @@ use crate::cpu::simd::LANES;
 use std::cell::{Cell, RefCell};
 
 /// Maximum floats of weight memory that a thread keeps. Longer blocks return to the
-/// allocator, which keeps them in programs that use [`crate::cpu::pages`].
+/// allocator, which keeps them in programs that use `subsplat_cli::pages`.
 const MAX_KEPT_WEIGHTS: usize = 1 << 20;
 
 thread_local! {

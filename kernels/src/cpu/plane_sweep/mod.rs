@@ -19,7 +19,7 @@ use super::simd::vectorize;
 use super::sums::dot;
 use rayon::prelude::*;
 
-/// Where a sample falls: index of the upper left tap and the four weights, zero for
+/// Taps of a sample: index of the upper left tap and the four weights, zero for
 /// taps outside.
 struct Sample {
     taps: [usize; 4],

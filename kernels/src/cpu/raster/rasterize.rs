@@ -41,7 +41,7 @@ pub struct Stats {
     pub bytes: usize,
 }
 
-/// Where the last frame's time went.
+/// Time of each stage of the last frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StageTimes {
     /// Geometry, colour and counting, from start to end.

@@ -73,7 +73,7 @@ impl Grid {
     }
 }
 
-/// Where one visible splat goes.
+/// Tiles of one visible splat.
 #[derive(Clone, Copy, Debug, Default)]
 struct Cover {
     /// Bits of the camera z.

@@ -106,7 +106,7 @@ impl Rasterizer {
         &self.times
     }
 
-    /// Renders `splats` as pairs_known by `camera`.
+    /// Renders `splats` as seen by `camera`.
     ///
     /// # Errors
     /// Errors of the device, or [`GpuError::TooSmall`]; the CPU rasterizer can be used instead.

@@ -127,8 +127,8 @@ fn print_report(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &Pair
     ));
     let median = report.epipolar.as_ref().and_then(|e| e.median_px);
     answer.line(format!(
-        "  {} shared points; they miss the lines that the cameras predict by {}; distance of the cameras \
-         {:.4}, turned by {:.1}°, angle of view {:.1}°×{:.1}°{}",
+        "  {} points appear in both photographs; their distance from the lines that the cameras predict: \
+         {}; cameras {:.4} apart, turned by {:.1}°, angle of view {:.1}°×{:.1}°{}",
         report.matches,
         median.map_or("an unknown number of pixels".to_owned(), |m| {
             format!("{m:.2} px (median, of 640 px)")

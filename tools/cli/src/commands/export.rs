@@ -83,7 +83,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     let kind = kind.trim_matches('"').to_owned();
     let of = if args.gaussians.is_some() { format!(" of {all}") } else { String::new() };
     answer.line(format!(
-        "{}: {}{of} splats, colours of SH degree {}, {:.1} MB",
+        "{}: {}{of} splats, colours of degree {} (0: the same from all sides), {:.1} MB",
         args.out.display(),
         report.count,
         report.sh_degree,

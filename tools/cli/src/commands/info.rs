@@ -29,7 +29,9 @@ fn file(path: &Path, answer: Answer) -> Result<Value> {
     match extension.as_str() {
         "safetensors" => weights(path, answer),
         "json" | "txt" | "bin" => scene(path, answer),
-        "png" | "jpg" | "jpeg" | "webp" | "bmp" | "tif" | "tiff" => picture(path, answer),
+        "png" | "jpg" | "jpeg" | "webp" | "bmp" | "tif" | "tiff" | "heic" | "heif" => {
+            picture(path, answer)
+        }
         _ => bail!(
             "{}: expected a splat file (.ply .glb .spz .splat .ksplat), weights (.safetensors), a \
              picture, a pose file or a scene folder, got `.{extension}`",
@@ -50,7 +52,7 @@ pub fn head(path: &Path) -> Result<Vec<u8>> {
 fn splats(path: &Path, answer: Answer) -> Result<Value> {
     let info = splat_info(path)?;
     answer.line(format!(
-        "{}: {}, {} splats, colours of SH degree {}, {} bytes",
+        "{}: {}, {} splats, colours of degree {} (0: the same from all sides), {} bytes",
         path.display(),
         info.flavour,
         info.count,
@@ -60,9 +62,9 @@ fn splats(path: &Path, answer: Answer) -> Result<Value> {
     if let Some([low, high]) = info.bounds {
         answer.line(format!("  positions from {low:?} to {high:?}"));
     }
-    answer.line(format!("  share of the splats below: {:?}", SplatInfo::QUANTILES));
-    answer.line(format!("  opacity, 1 is opaque:      {:?}", info.opacity));
-    answer.line(format!("  size, the scene's unit:    {:?}", info.scale));
+    answer.line(format!("  quantiles over the splats: {:?}", SplatInfo::QUANTILES));
+    answer.line(format!("  opacity (1: opaque):       {:?}", info.opacity));
+    answer.line(format!("  size (the scene's unit):   {:?}", info.scale));
     answer.line(format!(
         "  {} splats are invisible, {} have numbers that are not finite",
         info.invisible, info.non_finite
@@ -82,7 +84,8 @@ fn weights(path: &Path, answer: Answer) -> Result<Value> {
     answer.line(format!("{}: {} tensors, {parameters} parameters", path.display(), tensors.len()));
     match weights.config().map(Config::to_json) {
         Some(json) => answer.line(format!("  configuration: {}", json?)),
-        None => answer.line("  the file does not say which network it is for (a bare checkpoint)"),
+        None => answer
+            .line("  the file names no network; run --weights takes re10k or small by its tensors"),
     }
     let shapes: serde_json::Map<String, Value> =
         tensors.iter().map(|(name, t)| (name.clone(), json!(t.dims()))).collect();

@@ -53,14 +53,14 @@ pub fn check_run(planned: &Planned<'_>) -> Result<()> {
     fits(&source, planned.bytes(), available(), RUN_HINT)
 }
 
-/// What to do where a reconstruction exceeds the memory.
+/// Advice where a reconstruction exceeds the memory.
 const RUN_HINT: &str =
     "choose a smaller --input-size, --upscale or --gaussians, or fewer photographs";
 
-/// What to do where a picture exceeds the memory.
+/// Advice where a picture exceeds the memory.
 const PICTURE_HINT: &str = "choose a smaller picture";
 
-/// Whether the memory is ample for a reconstruction: half as much again as the lower bound, which
+/// Returns whether the memory is ample for a reconstruction: half as much again as the lower bound, which
 /// leaves room for the fit to the photographs (measured: 1.3 times the bound).
 pub fn is_ample(planned: &Planned<'_>) -> bool {
     let needed = planned.bytes().saturating_mul(3) / 2;

@@ -136,9 +136,9 @@ pub fn print_estimate(estimated: &EstimatedScene) {
         Confidence::Low => "DOUBTFUL",
     };
     print_line(format!(
-        "the cameras of {placed} of {} photographs were found by {} points: {certain} (rotations \
-         within about {:.2}°, directions between cameras within {:.2}°); the unit of length is the \
-         median distance of the points",
+        "the cameras of {placed} of {} photographs were estimated from {} shared points: {certain} \
+         (error of rotations about {:.2}°, of directions between cameras about {:.2}°); the unit of \
+         length is the median distance of the points",
         estimate.cameras.len(),
         estimate.points.len(),
         estimate.rotation_error_deg,
@@ -181,7 +181,7 @@ impl From<PoseConventionArg> for PoseConvention {
 }
 
 impl PairArgs {
-    /// Whether the command line gives the pose of the second of two photographs.
+    /// Returns whether the command line gives the pose of the second of two photographs.
     fn has_pose(&self) -> bool {
         self.translation.is_some() || self.pose_b.is_some()
     }

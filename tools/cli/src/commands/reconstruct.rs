@@ -176,14 +176,14 @@ fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {
     print_line(crop_line(prepared.inputs(), prepared.cut_shares()));
     match prepared.pose_adjustment() {
         Some(a) => print_line(format!(
-            "the cameras were adjusted by {} points that the photographs share: turned by {:.2} degrees \
-             at most; the points missed by {:.2} px in the median and now by {:.2} px",
+            "the cameras were adjusted to {} points that the photographs share: turned by {:.2} degrees \
+             at most; median error of the points {:.2} px before, {:.2} px now",
             a.points, a.turned_deg, a.before_px, a.after_px
         )),
         None if poses == Poses::Adjusted => {
             print_line(
-                "the cameras stay as they are: they fit the photographs, or the photographs share too \
-                 few points to tell",
+                "the cameras were not adjusted: they agree with the photographs, or too few points are \
+                 shared to decide",
             );
         }
         None => {}
@@ -191,8 +191,8 @@ fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {
     prepared.warnings().iter().for_each(print_warning);
     if prepared.reports().iter().any(|r| r.verdict == Verdict::Bad) {
         print_warning(
-            "these cameras do not fit the photographs, so the scene will be smeared; `subsplat check` \
-             shows where",
+            "these cameras disagree with the photographs, so the scene will be smeared; `subsplat check` \
+             draws the disagreement",
         );
     }
     print_depth_range(prepared.depth_range());
@@ -211,8 +211,8 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
     if let Some(fit) = result.fit() {
         let FitReport { before, after, .. } = fit;
         print_line(format!(
-            "sizes, opacities and colours of the splats were matched to the photographs: pictures of \
-             the scene differed from them by {before:.5} and now by {after:.5} (--fit 0 leaves this out)"
+            "sizes, opacities and colours of the splats were matched to the photographs: their \
+             difference was {before:.5} and is {after:.5} (0: equal; --fit 0 leaves this out)"
         ));
     }
     if let Some(refinement) = result.refinement() {
@@ -222,9 +222,9 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
             n => format!("; {n} splats that hardly show were removed"),
         };
         print_line(format!(
-            "the splats were moved and reshaped in {steps} steps: photographs, drawn again from the \
-             splats of the others, differed by {before:.5} and now by {after:.5} (--refine off leaves \
-             this out){removed}"
+            "{steps} steps moved and reshaped the splats to sharpen new views: each photograph, drawn from \
+             the splats of the other photographs, differed by {before:.5} and now by {after:.5} (0: equal; \
+             --refine off leaves this out){removed}"
         ));
     }
 }

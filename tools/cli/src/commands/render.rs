@@ -216,7 +216,7 @@ fn named_cameras(
     let Some(all) = cameras_beside(args.cameras.as_deref(), file)? else {
         ensure!(
             args.target.is_empty(),
-            "--target: expected --cameras or cameras.json beside the scene"
+            "--target: expected --cameras, or cameras.json beside the scene, got neither"
         );
         let camera = camera_of_comments(comments);
         print_line(match camera {

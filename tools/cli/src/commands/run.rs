@@ -188,7 +188,7 @@ pub fn photographs(
 }
 
 /// Photographs without a pose file of which all are context by default. Five score above their nearest pair on
-/// average (README), and their Gaussians are few enough for an automatic refinement.
+/// average (src/network/shipped/README.md, "Many photographs"), and their Gaussians are few enough for an automatic refinement.
 const CONTEXT_MAX: usize = 5;
 
 /// Chooses the context frames of the scene at `input`: those of `named`, or a default. Returns
@@ -249,7 +249,7 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
     };
     if chosen.is_empty() {
         print_line(format!(
-            "no photographs are left to compare with: {} views from the first camera to the last",
+            "no photographs are left to compare with: {} views are drawn on the way from the first camera to the last",
             path_frames(args)
         ));
     }

@@ -18,7 +18,7 @@ const HORIZONTAL: f32 = 0.3;
 
 /// Bounds of a scene's splats without outliers.
 pub fn bounds(splats: &Splats) -> Result<Bounds> {
-    Bounds::of(splats.means()).context("the scene holds no splat")
+    Bounds::of(splats.means()).context("the scene has no splat with a finite position")
 }
 
 /// A level camera that shows the central 96 % of the means, from the side on which the photographs
@@ -41,7 +41,7 @@ pub fn camera(splats: &Splats, comments: &[String]) -> Result<Camera> {
     let world_from_view = Mat3::from_cols((-up).cross(direction), -up, direction);
     let view_from_world = world_from_view.transpose();
     let turned = splats.means().map(|p| (view_from_world * Vec3::from(p)).to_array());
-    let bounds = Bounds::of(turned).context("the scene holds no splat")?;
+    let bounds = Bounds::of(turned).context("the scene has no splat with a finite position")?;
     let camera = bounds.camera(FOV_X, SIDE)?;
     let pose = Mat4::from_mat3(world_from_view) * camera.world_from_camera();
     Ok(Camera::new(camera.intrinsics(), pose)?)

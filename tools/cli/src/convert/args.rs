@@ -12,12 +12,11 @@ Exit codes: 0 success; 1 an error, one line on stderr and no file; 2 wrong usage
 
 --json: one object and nothing else on stdout; {\"error\": ...} with exit codes 1 and 2.";
 
-/// PyTorch checkpoints to .safetensors weights of subsplat.
+/// Converts PyTorch checkpoints to .safetensors weights of subsplat.
 ///
-/// Reads files of torch.save without executing anything in them, and .safetensors: Lightning
-/// checkpoints, state dicts, {"model": ...}. Checks every tensor against the architecture by
-/// name and shape. Leaves out and counts tensors that the model does not have (optimizer state,
-/// classifiers).
+/// The program reads files of torch.save and .safetensors: Lightning checkpoints, state dicts,
+/// {"model": ...}. It executes nothing in a checkpoint. It checks every tensor by name and shape, and
+/// leaves out and counts tensors that the model does not have (optimizer state, classifiers).
 #[derive(Debug, Parser)]
 #[command(name = "subsplat-convert", version, max_term_width = 100, after_help = EXIT_CODES)]
 pub struct Args {

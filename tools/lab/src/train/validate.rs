@@ -119,7 +119,7 @@ impl Validator {
         weights: BTreeMap<String, Tensor>,
         sheet: Option<&Path>,
     ) -> Result<[Option<Found>; 2]> {
-        // As in `pipeline`: heads without weights split each pixel evenly.
+        // As in `subsplat::reconstruct`: heads without weights split each pixel evenly.
         let weights = Weights::from_tensors(weights).allow_missing(SUBSPLAT_PREFIX, 0);
         let model = SubSplat::new(&self.model, weights.builder())?;
         let path = |end: &str| {

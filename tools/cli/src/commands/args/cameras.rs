@@ -11,10 +11,10 @@ use clap::{Args, ValueEnum};
 /// the first camera is the world unless --pose-a is given.
 #[derive(Clone, Debug, Args)]
 pub struct PairArgs {
-    /// Angle of view across, degrees, where EXIF does not tell it.
+    /// Horizontal angle of view of all photographs, degrees; replaces EXIF's.
     ///
-    /// It holds for all photographs. Without it and without EXIF the focal length is estimated, which two photographs alone often
-    /// do badly.
+    /// Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
+    /// photographs alone is often wrong.
     #[arg(
         long,
         value_name = "DEG",

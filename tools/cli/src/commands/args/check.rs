@@ -23,7 +23,7 @@ pub struct CheckArgs {
     /// choose.
     #[arg(long, value_delimiter = ',', value_name = "I,J,…", help_heading = CAMERAS)]
     pub context: Vec<String>,
-    /// Cameras of two loose photographs.
+    /// Cameras of photographs without a pose file.
     #[command(flatten)]
     pub pair: PairArgs,
 }

@@ -34,7 +34,7 @@ impl SceneFormatArg {
 /// Content of a scene file.
 #[derive(Clone, Copy, Debug, Args)]
 pub struct ContentArgs {
-    /// How finely colours may change with the view: degree of the spherical harmonics, 0 to 3.
+    /// Variation of a splat's colour with the viewing direction: degree of the spherical harmonics, 0 to 3.
     ///
     /// 0 gives a splat one colour for all views and the smallest file. Default: 3, which viewers
     /// expect. A .ply holds 0, 9, 24 or 45 values `f_rest` accordingly.

@@ -1,6 +1,6 @@
 //! Headings under which `--help` lists the flags.
 
-/// What is drawn, and from where.
+/// Views to draw.
 pub const PICTURES: &str = "Pictures";
 /// Photographs of the scene, and where they were taken.
 pub const CAMERAS: &str = "Cameras";

@@ -39,11 +39,11 @@ use view::{KEYS, ViewArgs};
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
 Exit codes: 0 success; 1 an error, one line on stderr; 2 wrong usage; 3 a negative answer (cameras
-that disagree with their photographs, photographs that do not tell where they were taken).
+that disagree with their photographs, photographs whose cameras cannot be estimated).
 
 --json: one object and nothing else on stdout; {\"error\": ...} with exit codes 1 and 2.";
 
-/// Photographs in, a 3D scene and sharp new views of it out.
+/// Makes a 3D scene from photographs, and draws sharp new views of it.
 ///
 /// A scene is a set of splats (3D Gaussians): soft spots of colour in space, a few for each pixel of
 /// the photographs.
@@ -73,8 +73,8 @@ pub struct Cli {
 pub enum Command {
     /// Make a 3D scene from photographs, and draw new views of it.
     ///
-    /// Two photographs of one place, taken a step apart, are enough. Up to five are all used; of more,
-    /// --context names those to use. The output folder gets the scene (scene.ply), the views (images/,
+    /// Two photographs of one place, taken a step apart, are enough. Up to five are all used. Of more,
+    /// the two that overlap best are used; --context names others. The output folder gets the scene (scene.ply), the views (images/,
     /// depth/), their cameras (cameras.json) and metrics.json.
     Run(Box<RunArgs>),
     /// Draw pictures or an animation of a finished scene.
@@ -88,12 +88,12 @@ pub enum Command {
     /// Show a scene in a window: only in builds with the feature `view`.
     #[cfg(not(feature = "view"))]
     View(NoViewArgs),
-    /// Find out where photographs were taken from, and with which focal length.
+    /// Estimate the cameras of photographs: position, direction and focal length.
     Poses(PosesArgs),
     /// Check whether cameras agree with their photographs.
     ///
-    /// Points that two photographs share are matched. Where the cameras are right, each point lies on
-    /// the line on which they expect it.
+    /// The program matches points that two photographs share. For each point, the cameras predict a line
+    /// in the other photograph. Correct cameras predict lines through the points.
     Check(CheckArgs),
     /// Describe a scene file, a photograph, a scene folder or weights.
     Info(InfoArgs),
@@ -140,7 +140,7 @@ fn radius_conflict(path: PathArg, motion: &MotionArgs) -> Option<String> {
 #[cfg(not(feature = "view"))]
 #[derive(Debug, clap::Args)]
 pub struct NoViewArgs {
-    /// Anything: the command says how to get a window.
+    /// Any arguments; the command prints an error that names the feature.
     #[arg(num_args = 0.., trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
     _ignored: Vec<String>,
 }

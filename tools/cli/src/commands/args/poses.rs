@@ -15,10 +15,10 @@ pub struct PosesArgs {
     /// The folder gets cameras.json, and COLMAP's text model in sparse/0.
     #[arg(short, long, default_value = "poses", value_name = "FILE | DIR")]
     pub out: PathBuf,
-    /// Angle of view across, degrees, where EXIF does not tell it.
+    /// Horizontal angle of view of all photographs, degrees; replaces EXIF's.
     ///
-    /// It holds for all photographs. Without it and without EXIF the focal length is estimated, which two photographs alone often
-    /// do badly.
+    /// Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
+    /// photographs alone is often wrong.
     #[arg(long, value_name = "DEG", conflicts_with = "intrinsics", value_parser = values::fov)]
     pub fov: Option<f32>,
     /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.

@@ -31,7 +31,7 @@ pub struct RenderArgs {
     /// Options of the rendering.
     #[command(flatten)]
     pub rendering: RenderingArgs,
-    /// How finely colours may change with the view: degree of the spherical harmonics, 0 to 4.
+    /// Variation of a splat's colour with the viewing direction: degree of the spherical harmonics, 0 to 4.
     ///
     /// 0 draws every splat in one colour from all sides.
     #[arg(
@@ -60,7 +60,7 @@ pub struct RenderArgs {
     /// the whole.
     #[arg(long, value_name = "SCENE", help_heading = CAMERAS)]
     pub cameras: Option<PathBuf>,
-    /// Which of these cameras: names or numbers (default: all).
+    /// Cameras to draw from, among those of --cameras: names or numbers from 0 (default: all).
     #[arg(long, value_delimiter = ',', value_name = "I,J,…", help_heading = CAMERAS)]
     pub target: Vec<String>,
     /// Size of the pictures in pixels: 1920x1080, or N for NxN.

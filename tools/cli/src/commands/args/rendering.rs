@@ -42,13 +42,13 @@ pub enum PathArg {
     /// Single views: those of --target; else photographs that the scene was not made from, or the
     /// cameras of a finished scene.
     Targets,
-    /// A way from the first photograph's camera to the last.
+    /// A path from the first photograph's camera to the last.
     Interpolate,
     /// A circle around the middle of the cameras.
     Orbit,
-    /// Two turns whose width and distance change.
+    /// A spiral of two turns around the middle of the cameras.
     Spiral,
-    /// Towards the scene and back.
+    /// A movement towards the scene and back.
     Dolly,
 }
 
@@ -85,7 +85,7 @@ pub struct MotionArgs {
         help_heading = PICTURES
     )]
     pub orbit_radius: Option<f32>,
-    /// The views as an animation: .gif, .webp, .mp4 or .webm.
+    /// File for the views as an animation: .gif, .webp, .mp4 or .webm.
     ///
     /// .gif and .webp need no other program; .mp4 and .webm need ffmpeg.
     #[arg(long, value_name = "FILE", help_heading = PICTURES)]
@@ -107,15 +107,15 @@ pub struct MotionArgs {
 pub struct RenderingArgs {
     /// Processor: cpu, auto, gpu, or a part of a GPU's name.
     ///
-    /// It draws the pictures. With `run` it does the largest parts of the reconstruction too. `auto` takes a GPU but no
-    /// program that imitates one, `gpu` takes either. Where the GPU fails, the CPU does the work,
-    /// with a warning.
+    /// The processor draws the pictures; with `run` it also does most of the reconstruction. `auto`: a
+    /// hardware GPU, else the CPU. `gpu`: any GPU, also one imitated in software. Where the GPU fails, the
+    /// CPU does the work, with a warning.
     #[arg(long, default_value = "cpu", value_name = "NAME")]
     pub device: String,
     /// Colour behind the scene: red, green and blue from 0 to 1.
     ///
-    /// Default: for photographs what the network was trained with (their mean colour, or black);
-    /// for a scene file what `run` wrote into it, else black.
+    /// Default: for photographs their mean colour, or black with `re10k`; for a scene file the colour that
+    /// `run` stored in it, else black.
     #[arg(
         long,
         value_parser = values::colour,
@@ -131,7 +131,7 @@ pub struct RenderingArgs {
     /// `standard`.
     #[arg(long, value_enum, hide_short_help = true, help_heading = PICTURES)]
     pub convention: Option<ConventionArg>,
-    /// The picture whose pixels bound how small a splat is drawn.
+    /// Smallest drawn size of a splat: a pixel of the drawn picture, or of the picture that the network reads.
     ///
     /// A splat smaller than a pixel would flicker. It is therefore drawn blurred by 0.3 square
     /// pixels, of the picture that is drawn or of the smaller one that the network reads.

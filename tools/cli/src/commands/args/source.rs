@@ -27,14 +27,14 @@ pub struct SourceArgs {
     pub adjust_poses: bool,
     /// Do not compare the photographs before the reconstruction.
     ///
-    /// The comparison finds cameras that do not fit, photographs of different exposure, and how near
-    /// and far the scene lies.
+    /// The comparison finds cameras that disagree with the photographs, differences of exposure, and the
+    /// nearest and farthest distance.
     #[arg(long, hide_short_help = true, help_heading = CAMERAS)]
     pub no_check: bool,
     /// Nearest distance at which the scene may lie, in the unit of the cameras' positions.
     ///
-    /// Default: what the pose file says; else found from the photographs. Of a finished scene in
-    /// `view`: nearer splats are not drawn.
+    /// Default: the value in the pose file, else an estimate from the photographs. For a finished scene
+    /// in `view`: nearer splats are not drawn.
     #[arg(
         long,
         allow_negative_numbers = true,
@@ -52,27 +52,26 @@ pub struct SourceArgs {
         help_heading = CAMERAS
     )]
     pub far: Option<f32>,
-    /// Enlargement over what the network reads, 1 to 8.
+    /// Size of the pictures over the size that the network reads, side over side: 1 to 8.
     ///
-    /// It is the ratio of the sides. The network reads the photographs small, as --quality says. Each pixel that it reads becomes
-    /// R x R splats: 4 for 2, 16 for 4. A number between two whole ones has the splats of the next
-    /// whole one. Default: what the weights were made for, else 2.
+    /// --quality sets the size that the network reads. Each of its pixels becomes R x R splats: 4 for 2,
+    /// 16 for 4. A fraction is rounded up for the splats. Default: that of the weights, else 2.
     #[arg(long, value_name = "R", value_parser = values::upscale, help_heading = SIZE)]
     pub upscale: Option<f32>,
     /// Part of the photographs to use.
     #[arg(long, value_enum, default_value = "whole", help_heading = SIZE)]
     pub crop: CropShapeArg,
-    /// Time against sharpness.
+    /// Level of quality: higher is sharper and slower.
     ///
-    /// One word for four numbers: --input-size, --gaussians, --fit and --refine. Each of these flags
-    /// overrides its part. The number of pixels that the network reads is printed.
+    /// Sets --input-size, --gaussians, --fit and --refine. Each of these flags overrides its part. The
+    /// program prints the number of pixels that the network reads.
     #[arg(long, value_enum, default_value = "normal", value_name = "LEVEL", help_heading = QUALITY)]
     pub quality: QualityArg,
-    /// Most splats (3D Gaussians): auto, 200000, 50% or 3/px.
+    /// Largest number of splats (3D Gaussians): auto, 200000, 50% or 3/px.
     ///
-    /// Even surfaces keep one splat for each pixel that the network reads, and what has detail gets
-    /// the rest. A share is one of all that --upscale would give, and 3/px gives every pixel three.
-    /// auto: all of two photographs; more photographs share those of two and a half.
+    /// Even surfaces keep one splat for each pixel that the network reads, and surfaces with detail get
+    /// the rest. A share is one of all splats that --upscale gives. 3/px gives each pixel three. auto:
+    /// all splats of two photographs; of more photographs, 2.5 times the splats of one.
     #[arg(
         long,
         value_name = "N",
@@ -95,17 +94,17 @@ pub struct SourceArgs {
     /// Steps that match sizes, opacities and colours of the splats to the photographs.
     ///
     /// The network's splats look blurred. Each step compares pictures of them with the photographs,
-    /// and changes all splats a little, but not their places. 0 leaves them as the network made
-    /// them, and leaves out --refine too unless it names a number. All levels of --quality take 4.
+    /// and changes all splats a little, but not their places. 0 leaves the splats as the
+    /// network made them; --refine is then left out too, unless it gives a number. Default: 4 at every
+    /// level of --quality.
     #[arg(long, value_name = "STEPS", hide_short_help = true, help_heading = QUALITY)]
     pub fit: Option<usize>,
     /// Steps that move and reshape the splats so that new views become sharper.
     ///
-    /// They follow those of --fit. Each draws one photograph from the splats and changes the splats to
-    /// come closer to it. `off`; a number of steps; or a time, such as `20s`. `auto`: eight steps a
-    /// photograph, 64 at most, and none for more than 1.5 million splats. New views are judged by
-    /// photographs that are drawn from the splats of the others: the steps end where these no longer
-    /// gain.
+    /// These steps follow those of --fit. Each step draws one photograph from the splats, and changes the
+    /// splats towards it. `off`; a number of steps; or a time, such as `20s`. `auto`: eight steps a
+    /// photograph, 64 at most, and none for more than 1.5 million splats. The steps end early where
+    /// photographs, drawn from the splats of the other photographs, no longer improve.
     #[arg(
         long,
         value_name = "auto | off | STEPS | SECONDSs",
@@ -114,7 +113,7 @@ pub struct SourceArgs {
         help_heading = QUALITY
     )]
     pub refine: Option<Refine>,
-    /// Where fine texture comes from.
+    /// Source of fine texture.
     #[arg(
         long,
         value_enum,
@@ -182,11 +181,11 @@ pub enum QualityArg {
     Fast,
     /// 256 x 256 pixels are read, and --gaussians and --refine are `auto`.
     Normal,
-    /// Up to 512 x 512 pixels are read, fewer where the photographs or the memory are smaller, with at
-    /// most 1.5 million splats: twice the time of normal, and 1.3 GiB for two photographs. Sharper where
-    /// the photographs overlap by 90 % or more; with less overlap, new views become no better.
+    /// Up to 512 x 512 pixels are read, with at most 1.5 million splats. Small photographs or little
+    /// memory reduce this. Takes twice the time of normal, and 1.3 GiB for two photographs. Sharper where
+    /// the photographs overlap by 90 % or more; elsewhere new views gain nothing.
     High,
-    /// As high, with twice the steps of --refine: three times the time of normal. Closest to the
+    /// As `high`, with twice the steps of --refine: three times the time of normal. Closest to the
     /// photographs; new views gain little.
     Best,
 }
@@ -226,7 +225,7 @@ pub enum InputSizeArg {
 /// Part of the photographs that the network reads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum CropShapeArg {
-    /// All of it; rounding of the sides may cut a few percent at the edges.
+    /// The whole photograph; rounding may cut a few percent at the edges.
     Whole,
     /// The square in the middle.
     Square,
@@ -235,9 +234,9 @@ pub enum CropShapeArg {
 /// Source of colour detail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum DetailArg {
-    /// From the network alone, which sees no more than what it reads: blurred.
+    /// The network alone: blurred, because it reads few pixels.
     Off,
-    /// From the photographs too, where they have more pixels than the network reads.
+    /// The photographs too, where they have more pixels than the network reads.
     Photo,
 }
 
@@ -280,7 +279,7 @@ pub enum BackboneArg {
 pub enum PresetArg {
     /// The paper's equations as written.
     Paper,
-    /// The same with the corrections that ARCHITECTURE.md lists.
+    /// The paper's equations with this project's corrections.
     Tuned,
 }
 

@@ -36,8 +36,9 @@ pub enum LevelsArg {
 pub struct ViewArgs {
     /// A finished scene, or photographs, a folder of them, or a scene with cameras.
     ///
-    /// A finished scene is a .ply, .compressed.ply, .splat, .spz, .ksplat or .glb. Of anything else a
-    /// scene is made first, as by `run`.
+    /// A finished scene is a .ply, .compressed.ply, .splat, .spz, .ksplat or .glb. From
+    /// other input the program makes a scene first, as `run` does. Of a folder that `run` wrote, name the
+    /// file: out/scene.ply.
     #[arg(required = true, num_args = 1.., value_name = "SPLATS | SCENE | IMG… | DIR")]
     pub input: Vec<PathBuf>,
     /// Folder for the pictures that the key P saves, as NAME-0001.png and so on.
@@ -45,7 +46,7 @@ pub struct ViewArgs {
     pub out: PathBuf,
     /// GPU that draws: gpu, auto, or a part of its name.
     ///
-    /// `gpu` takes any, `auto` none that a program imitates.
+    /// `gpu` takes any GPU, `auto` only a hardware GPU.
     #[arg(long, default_value = "gpu", value_name = "NAME")]
     pub device: String,
     /// Cameras of a finished scene: a pose file of any kind, or a scene folder.
@@ -72,7 +73,7 @@ pub struct ViewArgs {
         help_heading = PICTURES
     )]
     pub save: Option<PathBuf>,
-    /// Fewer splats where they are far away, or all; the key L switches.
+    /// Splats far away: auto merges them (faster), off draws all; the key L switches.
     #[arg(long, value_enum, default_value_t = LevelsArg::Auto, help_heading = PICTURES)]
     pub levels: LevelsArg,
     /// Rules by which splats are drawn.
@@ -83,8 +84,8 @@ pub struct ViewArgs {
     pub convention: Option<ConventionArg>,
     /// Colour behind the scene: red, green and blue from 0 to 1.
     ///
-    /// Default: for photographs what the network was trained with (their mean colour, or black);
-    /// for a scene file what `run` wrote into it, else black.
+    /// Default: for photographs their mean colour, or black with `re10k`; for a scene file the colour that
+    /// `run` stored in it, else black.
     #[arg(
         long,
         value_parser = values::colour,

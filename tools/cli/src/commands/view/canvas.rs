@@ -158,7 +158,7 @@ impl Canvas {
     fn check(&self) -> Result<()> {
         self.gpu.check()?;
         let fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner).take();
-        fault.map_or(Ok(()), |reason| Err(anyhow!("GPU refused a frame: {reason}")))
+        fault.map_or(Ok(()), |reason| Err(anyhow!("the GPU could not draw a frame: {reason}")))
     }
 
     /// True if the device is lost; no other frame can then be drawn.
@@ -186,7 +186,7 @@ impl Canvas {
                 }
                 Current::Validation => {
                     self.check()?;
-                    return Err(anyhow!("window: its surface gives no texture"));
+                    return Err(anyhow!("window: expected a texture to draw to, got none"));
                 }
             }
         }

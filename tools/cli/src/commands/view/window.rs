@@ -259,7 +259,7 @@ impl Viewer {
         // A picture that is saved depends on the camera only.
         let exact = self.levels && (self.picture || self.plan.frames.is_some());
         if exact && let Err(e) = ready.detail.complete(&now, canvas.gpu()) {
-            print_warning(format!("level of detail: {e:#}; all Gaussians are drawn"));
+            print_warning(format!("far splats cannot be merged: {e:#}; all splats are drawn"));
         }
         let fit = if exact { Fit::Exact } else { Fit::Fine };
         let coarser = self.levels.then(|| ready.detail.scene(&now, fit)).flatten();
@@ -268,7 +268,10 @@ impl Viewer {
         let frame = match canvas.draw(scene, &ready.options, camera, capture) {
             Ok(frame) => frame,
             Err(e) if self.before != self.current && !canvas.is_lost() => {
-                print_warning(format!("x{}: {e:#}; back to x{}", self.current, self.before));
+                print_warning(format!(
+                    "the scene at x{} cannot be drawn: {e:#}; x{} is shown again",
+                    self.current, self.before
+                ));
                 self.ready.remove(&self.current);
                 (self.current, self.requested) = (self.before, self.before);
                 self.change();
@@ -319,7 +322,9 @@ impl Viewer {
         let Some(ready) = self.ready.values_mut().find(|r| r.number == number) else { return };
         match ready.detail.finish(outcome) {
             Ok(()) => self.change(),
-            Err(e) => print_warning(format!("fewer splats far away: {e:#}; all splats are drawn")),
+            Err(e) => {
+                print_warning(format!("far splats cannot be merged: {e:#}; all splats are drawn"))
+            }
         }
     }
 
@@ -435,7 +440,7 @@ impl Viewer {
             drop(proxy.send_event(Message::Done(r, done.map_err(|e| format!("{e:#}")))));
         };
         if let Err(e) = std::thread::Builder::new().name(format!("x{r}")).spawn(work) {
-            print_warning(format!("x{r}: no thread to make it: {e}"));
+            print_warning(format!("the scene at x{r} cannot be made: no thread: {e}"));
             (self.busy, self.requested) = (None, self.current);
         }
     }

@@ -207,7 +207,7 @@ impl<'a> Maker<'a> {
         }
         if self.table.kind.has_memory() {
             notes.push(
-                "GB: peak memory of `subsplat eval` of one generated room by this method, in a process \
+                "GB: peak memory of `subsplat-lab eval` of one generated room by this method, in a process \
                  of its own; the paper's on one A100."
                     .to_owned(),
             );
@@ -388,7 +388,7 @@ impl<'a> Maker<'a> {
         Ok(())
     }
 
-    /// Measures the peak memory of each row with a model, by `subsplat eval` in a process of its own.
+    /// Measures the peak memory of each row with a model, by `subsplat-lab eval` in a process of its own.
     fn measure_memory(
         &self,
         setting: &Setting,
