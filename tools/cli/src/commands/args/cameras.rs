@@ -11,9 +11,9 @@ use clap::{Args, ValueEnum};
 /// the first camera is the world unless --pose-a is given.
 #[derive(Clone, Debug, Args)]
 pub struct PairArgs {
-    /// Horizontal angle of view of all photographs, degrees; replaces EXIF's.
+    /// Angle of view across, degrees; replaces EXIF's.
     ///
-    /// Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
+    /// It holds for all photographs. Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
     /// photographs alone is often wrong.
     #[arg(
         long,

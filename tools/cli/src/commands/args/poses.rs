@@ -15,9 +15,9 @@ pub struct PosesArgs {
     /// The folder gets cameras.json, and COLMAP's text model in sparse/0.
     #[arg(short, long, default_value = "poses", value_name = "FILE | DIR")]
     pub out: PathBuf,
-    /// Horizontal angle of view of all photographs, degrees; replaces EXIF's.
+    /// Angle of view across, degrees; replaces EXIF's.
     ///
-    /// Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
+    /// It holds for all photographs. Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
     /// photographs alone is often wrong.
     #[arg(long, value_name = "DEG", conflicts_with = "intrinsics", value_parser = values::fov)]
     pub fov: Option<f32>,

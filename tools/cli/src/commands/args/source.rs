@@ -52,7 +52,7 @@ pub struct SourceArgs {
         help_heading = CAMERAS
     )]
     pub far: Option<f32>,
-    /// Size of the pictures over the size that the network reads, side over side: 1 to 8.
+    /// Side of the pictures over that of what the network reads, 1 to 8.
     ///
     /// --quality sets the size that the network reads. Each of its pixels becomes R x R splats: 4 for 2,
     /// 16 for 4. A fraction is rounded up for the splats. Default: that of the weights, else 2.
@@ -61,13 +61,13 @@ pub struct SourceArgs {
     /// Part of the photographs to use.
     #[arg(long, value_enum, default_value = "whole", help_heading = SIZE)]
     pub crop: CropShapeArg,
-    /// Level of quality: higher is sharper and slower.
+    /// Higher is sharper and slower.
     ///
     /// Sets --input-size, --gaussians, --fit and --refine. Each of these flags overrides its part. The
     /// program prints the number of pixels that the network reads.
     #[arg(long, value_enum, default_value = "normal", value_name = "LEVEL", help_heading = QUALITY)]
     pub quality: QualityArg,
-    /// Largest number of splats (3D Gaussians): auto, 200000, 50% or 3/px.
+    /// Most splats (3D Gaussians): auto, 200000, 50% or 3/px.
     ///
     /// Even surfaces keep one splat for each pixel that the network reads, and surfaces with detail get
     /// the rest. A share is one of all splats that --upscale gives. 3/px gives each pixel three. auto:
