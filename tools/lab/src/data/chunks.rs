@@ -9,7 +9,7 @@
 //! row-major 3×4 matrix camera-from-world with OpenCV axes. The reader converts it to the crate's
 //! `world_from_camera`.
 //!
-//! The reader executes nothing in a chunk ([`subsplat::files::torch`]). Pictures are read one at a time,
+//! The reader executes nothing in a chunk ([`subsplat::files::weights::torch`]). Pictures are read one at a time,
 //! so that opening a chunk of 100 MB needs memory for its list of frames only.
 
 use glam::{DMat4, DVec4, Mat4};

@@ -1,5 +1,5 @@
 //! Training examples from data sets on disk: pixelSplat's chunks (RealEstate10K, ACID) and folders
-//! of scenes in any format of [`subsplat::files::scene`].
+//! of scenes in any format of [`subsplat::files::poses::scene`].
 //!
 //! The examples form a stream. One round (epoch) visits every scene once. Chunks are shuffled, and
 //! scenes are shuffled within their chunk, as in the reference loader, so that consecutive examples
