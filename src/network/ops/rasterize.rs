@@ -78,9 +78,8 @@ pub fn rasterize_on(
 /// As [`rasterize`].
 ///
 /// ```
-/// use candle_core::{Device, Tensor, Var};
-/// use subsplat_kernels::layout::{RasterOptions, ShBasis};
-/// use subsplat_kernels::camera::{Camera, Intrinsics};
+/// use subsplat::network::candle_core::{Device, Tensor, Var};
+/// use subsplat::{Camera, Intrinsics, RasterOptions, ShBasis};
 /// use subsplat::SplatTensors;
 ///
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -93,7 +92,7 @@ pub fn rasterize_on(
 /// let basis = ShBasis::Standard;
 /// let splats = SplatTensors::from_parts(&means, &quats, &scales, &opacities, &sh, basis)?;
 /// let k = Intrinsics { fx: 30.0, fy: 30.0, cx: 16.0, cy: 12.0, width: 32, height: 24 };
-/// let camera = Camera::new(k, glam::Mat4::IDENTITY)?;
+/// let camera = Camera::new(k, subsplat::glam::Mat4::IDENTITY)?;
 /// let planes = subsplat::rasterize(&splats, &camera, &RasterOptions::default())?;
 /// let rgb = planes.narrow(0, 0, 3)?;
 /// let gradients = rgb.sqr()?.sum_all()?.backward()?;
