@@ -11,7 +11,10 @@ use crate::network::model::trace::Checkpoint;
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
-use subsplat_kernels::layout::{CHILDREN_MAX, RasterOptions};
+use subsplat_kernels::layout::{CHILDREN_MAX, RasterOptions, gain_with_offsets};
+
+/// Numbers of a gain with colour offsets: γ, then δ.
+const GAIN_WITH_OFFSETS: usize = 4;
 
 /// Gaussians of a scene.
 pub struct SceneChildren {
@@ -132,6 +135,26 @@ impl SceneChildren {
         let groups = Groups { ranges, equal_families: false };
         let origins = Origins::Mixed { parents: mixed.parents, counts };
         Ok(Self { splats: mixed.splats, groups, distances, origins })
+    }
+
+    /// Adds the colour offsets of `parents` to those of their children. Parents without offsets change
+    /// nothing.
+    pub fn add_offsets(&mut self, parents: &Splats) {
+        if parents.gain_channels() != GAIN_WITH_OFFSETS || self.splats.is_empty() {
+            return;
+        }
+        let count = self.splats.len();
+        let children = (count / parents.len().max(1)).max(1);
+        let mut gain = gain_with_offsets(&self.splats.gain, count);
+        for (i, gain) in gain.chunks_exact_mut(GAIN_WITH_OFFSETS).enumerate() {
+            let parent = match &self.origins {
+                Origins::Regular => i / children,
+                Origins::Mixed { parents, .. } => parents[i] as usize,
+            };
+            let of = &parents.gain[parent * GAIN_WITH_OFFSETS..][..GAIN_WITH_OFFSETS];
+            gain[1..].iter_mut().zip(&of[1..]).for_each(|(own, of)| *own += of);
+        }
+        self.splats.gain = gain;
     }
 
     /// Adds the photographs' detail to the colours. Returns whether any photograph has detail.

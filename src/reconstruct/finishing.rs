@@ -74,7 +74,8 @@ fn views_of(inputs: &[Cropped]) -> Vec<TargetView<'_>> {
     inputs.iter().map(view).collect()
 }
 
-fn error(e: FinishError) -> Error {
+/// The error of a run for one of the optimisation.
+pub(super) fn error(e: FinishError) -> Error {
     match e {
         FinishError::Cancelled => Error::Cancelled,
         FinishError::NoClock => Error::argument(

@@ -28,15 +28,18 @@
 //!    their depths replace a range that was only guessed, and their colours bring the
 //!    photographs to the exposure of the one of middle brightness.
 //! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
-//! 5. The network predicts one primary Gaussian per input pixel, then its children.
-//! 6. The photographs add detail to the children's colours ([`Detail`]).
-//! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::finish::fit()`]).
-//! 8. Means, shapes, opacities and colours are refined on the photographs ([`crate::finish::refine()`]).
+//! 5. The network predicts one primary Gaussian per input pixel.
+//! 6. Primaries move to the depth at which the photographs agree ([`Matching`]), and are optimised on the
+//!    photographs of the input's size. The network then predicts their children.
+//! 7. The photographs add detail to the children's colours ([`Detail`]).
+//! 8. Sizes, opacities and colours are fitted to the photographs ([`crate::finish::fit()`]).
+//! 9. Means, shapes, opacities and colours are refined on the photographs ([`crate::finish::refine()`]).
 //!
 //! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
 //! the caller can then free large photographs before the network runs.
 
 mod children;
+mod coarse_to_fine;
 mod density;
 mod depth_range;
 mod detail;
@@ -64,7 +67,9 @@ pub use estimate_cameras::{
     estimate_cameras_of_files,
 };
 pub use input_size::InputSize;
-pub use options::{Check, Detail, Options, Poses, Quality, QualitySettings, Refine, TargetSize};
+pub use options::{
+    Check, Detail, Matching, Options, Poses, Quality, QualitySettings, Refine, TargetSize,
+};
 pub use photo::{Photo, Photographs};
 pub use poses::PoseError;
 pub use prepared::Prepared;
@@ -74,12 +79,14 @@ pub use reconstructor::Reconstructor;
 pub use warning::Warning;
 
 pub(crate) use children::{SceneChildren, counts_of};
+pub(crate) use coarse_to_fine::{match_parents, options_of_parents, refine_parents};
 pub(crate) use finishing::{check_refine, fit_to_inputs, refine_on_inputs};
 pub(crate) use poses::check_pairs;
 
 /// The stages of a run, one by one, for evaluation. No version promises anything about them.
 pub mod stages {
     pub use super::children::{Counts, SceneChildren, counts_of};
+    pub use super::coarse_to_fine::{match_parents, options_of_parents, refine_parents};
     pub use super::detail::add_detail;
     pub use super::equal_exposure::equalise;
     pub use super::finishing::{fit_to_inputs, refine_on_inputs};

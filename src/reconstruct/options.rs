@@ -35,6 +35,9 @@ pub struct Options {
     pub poses: Poses,
     /// Check of the poses by matched points. Default: [`Check::Warn`].
     pub check: Check,
+    /// Correction of the network's depth; none where neither [`Options::fit`] nor [`Options::refine`]
+    /// changes the Gaussians. Default: [`Matching::Photographs`].
+    pub matching: Matching,
     /// Source of colour detail. Default: [`Detail::Photographs`].
     pub detail: Detail,
     /// Fit of the Gaussians to the photographs ([`crate::finish::fit()`]). Default: four steps.
@@ -117,6 +120,13 @@ impl Options {
         self
     }
 
+    /// Sets [`Options::matching`].
+    #[must_use]
+    pub fn with_matching(mut self, matching: Matching) -> Self {
+        self.matching = matching;
+        self
+    }
+
     /// Sets [`Options::detail`].
     #[must_use]
     pub fn with_detail(mut self, detail: Detail) -> Self {
@@ -147,6 +157,12 @@ impl Options {
             _ => photos,
         };
         self.input_size.limited_to(shapes, upscale).resolve(shapes, stride)
+    }
+
+    /// Returns whether depth is matched: not where the Gaussians are to stay the network's.
+    pub(super) fn matches_depth(&self) -> bool {
+        let stays = self.fit.steps == 0 && self.refine_options(2, 0).steps == 0;
+        self.matching == Matching::Photographs && !stays
     }
 
     /// Options of the refinement for a number of photographs and of Gaussians.
@@ -380,6 +396,18 @@ pub enum Check {
     /// Poses that are judged bad give [`Error::Poses`](super::Error::Poses); other findings
     /// become warnings.
     Refuse,
+}
+
+/// Correction of the depth that the network predicts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Matching {
+    /// Each pixel moves to the depth at which patches of the photographs agree
+    /// ([`crate::cameras::dense`]). A network with several Gaussians a pixel keeps its own depth.
+    #[default]
+    Photographs,
+    /// The network's own depth.
+    Off,
 }
 
 /// Source of colour detail below the size of an input pixel.

@@ -3,7 +3,8 @@
 use super::progress::Tracker;
 use super::{
     DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, SceneChildren,
-    Stage, Warning, counts_of, fit_to_inputs, refine_on_inputs,
+    Stage, Warning, counts_of, fit_to_inputs, match_parents, options_of_parents, refine_on_inputs,
+    refine_parents,
 };
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
@@ -99,13 +100,35 @@ impl Prepared<'_> {
         let features =
             tracker.run_steps(steps, progress, |step| network.encode_scene(&views, step))?;
         tracker.begin(Stage::Primaries, progress)?;
-        let encoding = network.place(features)?;
-        tracker.begin(Stage::Subsplat, progress)?;
+        let mut encoding = network.place(features)?;
         let config = model.config();
         let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
         let raster_at = |ratio: f32| config.raster_options(ratio, bounds.near, colour);
         let mut renderer = Renderer::new(model.backend());
         let density = options.density;
+        let per_scene = encoding.per_view() * inputs.len();
+        let expected = density.limit(per_scene, inputs.len(), config.upscale);
+        let scene_options = options.refine_options(inputs.len(), expected);
+        let parents_options = options_of_parents(&scene_options, &inputs);
+        let mut factors = Vec::new();
+        let mut parents = None;
+        if options.matches_depth() || parents_options.is_some() {
+            let mut own = encoding.parents(network)?;
+            if options.matches_depth() {
+                tracker.begin(Stage::Matching, progress)?;
+                let mut part = tracker.parts(progress);
+                factors = match_parents(&mut own, &inputs, bounds.near_far(), &mut part)?;
+            }
+            if let Some(options) = &parents_options {
+                tracker.begin(Stage::Parents, progress)?;
+                let mut part = tracker.parts(progress);
+                let (raster, renderer) = (&raster_at(1.0), &mut renderer);
+                refine_parents(&mut own, &inputs, raster, options, renderer, &mut part)?;
+            }
+            encoding = encoding.with_parents(network, &own)?;
+            parents = Some(own);
+        }
+        tracker.begin(Stage::Subsplat, progress)?;
         let counts =
             counts_of(network, &encoding, &inputs, density, &raster_at(1.0), &mut renderer)?;
         let steps = encoding.steps(network.trunk());
@@ -113,6 +136,12 @@ impl Prepared<'_> {
             SceneChildren::new(network, &encoding, inputs.len(), counts, step)
         })?;
         drop((views, encoding));
+        if let Some(parents) = parents {
+            children.add_offsets(&parents);
+        }
+        for (distances, factors) in children.distances.iter_mut().zip(&factors) {
+            distances.iter_mut().zip(factors).for_each(|(distance, factor)| *distance *= factor);
+        }
         let mut detail = Detail::Off;
         if options.detail == Detail::Photographs {
             tracker.begin(Stage::Detail, progress)?;
@@ -125,7 +154,12 @@ impl Prepared<'_> {
         let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
         let fit_options = &options.fit;
-        let refine_options = options.refine_options(inputs.len(), splats.len());
+        let mut refine_options = options.refine_options(inputs.len(), splats.len());
+        if let (Some(time), Some(used)) =
+            (refine_options.time, parents_options.and_then(|options| options.time))
+        {
+            refine_options.time = Some(time.saturating_sub(used));
+        }
         if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;
             let mut part = tracker.parts(progress);

@@ -34,6 +34,10 @@ pub enum Stage {
     Backbone,
     /// Primary Gaussians are made of the backbone's outputs.
     Primaries,
+    /// Depth is matched between the photographs.
+    Matching,
+    /// Primaries are optimised on the photographs of the input's size.
+    Parents,
     /// SubSplat divides the primaries into children.
     Subsplat,
     /// Photographs add detail to colours.
@@ -54,6 +58,8 @@ impl Stage {
             Self::DepthRange => "depth range",
             Self::Backbone => "backbone",
             Self::Primaries => "primaries",
+            Self::Matching => "matching",
+            Self::Parents => "parents",
             Self::Subsplat => "subsplat",
             Self::Detail => "detail",
             Self::Fit => "fit",
@@ -70,6 +76,8 @@ impl Stage {
             Self::DepthRange => "finding the nearest and the farthest point",
             Self::Backbone => "estimating distances",
             Self::Primaries => "placing splats",
+            Self::Matching => "correcting distances",
+            Self::Parents => "adjusting splats",
             Self::Subsplat => "dividing splats",
             Self::Detail => "adding fine texture",
             Self::Fit => "matching sizes and colours",

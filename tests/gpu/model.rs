@@ -161,6 +161,46 @@ fn the_host_reads_the_picture_alone() {
     assert_eq!((end.count - read.count, end.bytes - read.bytes), (6, 4 * floats as u64));
 }
 
+/// Parents that the host moved have the children that the CPU computes from them, on the GPU and after it is
+/// lost.
+#[test]
+fn children_follow_parents_that_moved() {
+    let Some(own) = limited(128 << 20) else { return };
+    let shoot = shoot(5, 2, 64, 64);
+    let views = views(&shoot);
+    let model = lively(&light(plain(false, Preset::Tuned, 2)));
+    let children = |model: &Reconstructor, moves: bool, lost: &dyn Fn()| {
+        let network = model.model();
+        let features = network.encode_scene(&views, &|| Ok(())).unwrap();
+        let mut encoding = network.place(features).unwrap();
+        if moves {
+            let mut parts = encoding.parents(network).unwrap().into_parts();
+            parts.rows.chunks_exact_mut(11).for_each(|row| row[2] += 0.3);
+            encoding = encoding.with_parents(network, &parts.try_into().unwrap()).unwrap();
+        }
+        lost();
+        encoding.children(network, &|| Ok(())).unwrap().children.to_splats().unwrap()
+    };
+    let [still, expected] = [false, true].map(|moves| children(&model, moves, &|| ()));
+    let height = |splats: &subsplat::Splats| {
+        splats.rows().iter().skip(2).step_by(11).map(|z| f64::from(*z)).sum::<f64>()
+            / splats.len() as f64
+    };
+    assert!((height(&expected) - height(&still) - 0.3).abs() < 0.05);
+    let backend = Backend::from(own.clone());
+    let model = model.with_backend(&backend);
+    let got = children(&model, true, &|| ());
+    assert_eq!(backend.warning(), None);
+    assert!((height(&got) - height(&expected)).abs() < 1e-3);
+    let lost = children(&model, true, &|| {
+        own.device().destroy();
+        own.device().poll(subsplat_kernels::gpu::wgpu::PollType::wait_indefinitely()).ok();
+    });
+    assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());
+    // The rows that were moved come from the GPU.
+    assert!((height(&lost) - height(&expected)).abs() < 1e-3);
+}
+
 /// Calls that are only counted are those that run, and need the same memory.
 #[test]
 fn counted_calls_are_those_that_run() {

@@ -28,12 +28,14 @@ fn quick() -> Options {
     Options::default().with_input_size(96, 96)
 }
 
-const STAGES: [Stage; 9] = [
+const STAGES: [Stage; 11] = [
     Stage::Crop,
     Stage::Check,
     Stage::DepthRange,
     Stage::Backbone,
     Stage::Primaries,
+    Stage::Matching,
+    Stage::Parents,
     Stage::Subsplat,
     Stage::Detail,
     Stage::Fit,

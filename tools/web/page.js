@@ -7,7 +7,8 @@ const PHOTOGRAPHS_MAX = 12;
 const STAGES = {
   cameras: "finding the cameras", crop: "cropping", check: "checking the cameras",
   "depth range": "estimating the depth range", backbone: "estimating depth",
-  primaries: "placing Gaussians", subsplat: "dividing Gaussians", detail: "adding detail",
+  primaries: "placing Gaussians", matching: "correcting depth", parents: "adjusting Gaussians",
+  subsplat: "dividing Gaussians", detail: "adding detail",
   fit: "fitting to the photographs", refine: "refining",
 };
 

@@ -88,6 +88,23 @@ impl Packed {
     }
 }
 
+impl Primaries {
+    /// The primaries of one scene with the attributes of packed rows `[N, 11]`.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub(super) fn with_rows(&self, rows: &Tensor) -> Result<Self> {
+        let part = |first: usize, count: usize| rows.narrow(1, first, count)?.unsqueeze(0);
+        Ok(Self {
+            means: part(MEAN_OFFSET, 3)?,
+            quats_wxyz: part(QUAT_OFFSET, 4)?,
+            scales: part(SCALE_OFFSET, 3)?,
+            opacities: part(OPACITY_OFFSET, 1)?.squeeze(2)?,
+            ..self.clone()
+        })
+    }
+}
+
 /// Computes all primaries of all scenes, in world frame.
 ///
 /// # Errors

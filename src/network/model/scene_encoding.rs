@@ -20,9 +20,9 @@ use super::trunk::{MixedChildren, Trunk};
 use super::{BackboneOutput, Primaries, Views};
 use crate::network::ops::{Array, TapeArray};
 use crate::scene::splats::Splats;
-use candle_core::{Result, Tensor, bail};
+use candle_core::{Device, Result, Tensor, bail};
 use subsplat_kernels::camera::Camera;
-use subsplat_kernels::layout::RasterOptions;
+use subsplat_kernels::layout::{RasterOptions, SPLAT_STRIDE};
 
 /// Outputs of the backbone for one scene.
 pub struct SceneFeatures {
@@ -34,6 +34,8 @@ pub struct SceneFeatures {
 pub struct SceneEncoding {
     views: Views,
     place: Place,
+    /// Rows `[N, 11]` that replace the primaries' own ones ([`SceneEncoding::with_parents`]).
+    moved: Option<Tensor>,
 }
 
 enum Output {
@@ -108,7 +110,8 @@ impl SubSplat {
                     .on_device(|_| DeviceParents::new(output, &views, settings, sh_input));
                 return match placed {
                     Some(parents) => {
-                        Ok(SceneEncoding { views, place: Place::Device(Box::new(parents?)) })
+                        let place = Place::Device(Box::new(parents?));
+                        Ok(SceneEncoding { views, place, moved: None })
                     }
                     None => self.encoding_on_host(&views),
                 };
@@ -127,7 +130,47 @@ impl SubSplat {
 impl SceneEncoding {
     /// Returns results in host memory.
     pub fn new(views: Views, output: BackboneOutput, primaries: Primaries) -> Self {
-        Self { views, place: Place::Host(output, primaries) }
+        Self { views, place: Place::Host(output, primaries), moved: None }
+    }
+
+    /// Replaces means, rotations, scales and opacities of the primaries by those of `parents`, which are
+    /// [`SceneEncoding::parents`] after an optimisation. Their colours stay those of the network.
+    ///
+    /// # Errors
+    /// Another number of parents; errors of the device.
+    pub fn with_parents(self, network: &SubSplat, parents: &Splats) -> Result<Self> {
+        let count = self.per_view() * self.views.views();
+        if parents.len() != count {
+            bail!("parents: expected {count}, got {}", parents.len());
+        }
+        let rows = Tensor::from_slice(&parents.rows, (count, SPLAT_STRIDE), &Device::Cpu)?;
+        self.moved(network, rows)
+    }
+
+    /// Replaces the primaries' rows.
+    fn moved(self, network: &SubSplat, rows: Tensor) -> Result<Self> {
+        let Self { views, place, .. } = self;
+        let place = match place {
+            Place::Host(output, primaries) => Place::Host(output, primaries.with_rows(&rows)?),
+            Place::Device(parents) => {
+                let replaced =
+                    network.trunk().on_device(|executor| parents.with_rows(executor, &rows));
+                match replaced {
+                    Some(parents) => Place::Device(Box::new(parents?)),
+                    None => return network.encoding_on_host(&views)?.moved(network, rows),
+                }
+            }
+        };
+        Ok(Self { views, place, moved: Some(rows) })
+    }
+
+    /// The same encoding, computed by the CPU after a failure of the device.
+    fn on_host(&self, network: &SubSplat) -> Result<Self> {
+        let host = network.encoding_on_host(&self.views)?;
+        match &self.moved {
+            Some(rows) => host.moved(network, rows.clone()),
+            None => Ok(host),
+        }
     }
 
     /// Returns the number of primaries of a view.
@@ -155,7 +198,7 @@ impl SceneEncoding {
             Place::Device(parents) => {
                 match network.trunk().on_device(|executor| parents.to_host(executor)) {
                     Some(parents) => parents,
-                    None => network.encoding_on_host(&self.views)?.parents(network),
+                    None => self.on_host(network)?.parents(network),
                 }
             }
         }
@@ -187,7 +230,7 @@ impl SceneEncoding {
                 });
                 return match made {
                     Some(made) => made,
-                    None => network.encoding_on_host(&self.views)?.children(network, checkpoint),
+                    None => self.on_host(network)?.children(network, checkpoint),
                 };
             }
         };
@@ -220,9 +263,7 @@ impl SceneEncoding {
                 });
                 return match made {
                     Some(made) => made,
-                    None => network
-                        .encoding_on_host(&self.views)?
-                        .mixed(network, parents, counts, checkpoint),
+                    None => self.on_host(network)?.mixed(network, parents, counts, checkpoint),
                 };
             }
         };
@@ -255,7 +296,7 @@ impl SceneEncoding {
                 });
                 match made {
                     Some(picture) => picture,
-                    None => network.encoding_on_host(&self.views)?.render(network, camera, options),
+                    None => self.on_host(network)?.render(network, camera, options),
                 }
             }
         }

@@ -79,6 +79,18 @@ impl DeviceParents {
         })
     }
 
+    /// The primaries with other rows `[N, 11]`.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub(in crate::network::model) fn with_rows(
+        &self,
+        executor: &Arc<Executor>,
+        rows: &Tensor,
+    ) -> Result<Self> {
+        Ok(Self { rows: executor.upload(rows)?, ..self.clone() })
+    }
+
     /// Returns copies in host memory: the primaries as their own children.
     ///
     /// # Errors

@@ -1,6 +1,6 @@
 //! The library's call with a progress bar and lines for the user: for `run` and `view`.
 
-use super::args::{CropShapeArg, DetailArg, SourceArgs};
+use super::args::{CropShapeArg, DetailArg, MatchingArg, SourceArgs};
 use super::memory::{self, Planned};
 use crate::pages;
 use crate::report::{Progress, print_line, print_warning, show_fraction};
@@ -15,8 +15,8 @@ use subsplat::network::config::Config;
 use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::{
-    Check, DepthBounds, DepthRange, Detail, InputSize, Options, Photo, Poses, Prepared, Quality,
-    Reconstruction, Reconstructor, TargetSize,
+    Check, DepthBounds, DepthRange, Detail, InputSize, Matching, Options, Photo, Poses, Prepared,
+    Quality, Reconstruction, Reconstructor, TargetSize,
 };
 use subsplat_kernels::camera::Size;
 
@@ -28,6 +28,10 @@ use subsplat_kernels::camera::Size;
 pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Options> {
     let check = if args.no_check { Check::Off } else { Check::Warn };
     let poses = if args.adjust_poses { Poses::Adjusted } else { Poses::Given };
+    let matching = match args.matching {
+        MatchingArg::Photo => Matching::Photographs,
+        MatchingArg::Off => Matching::Off,
+    };
     let detail = match args.detail {
         DetailArg::Photo => Detail::Photographs,
         DetailArg::Off => Detail::Off,
@@ -38,6 +42,7 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_depth_range(DepthRange::from_ends(args.near, args.far))
         .with_depth_prior(DepthBounds::of_scene(scene, context)?)
         .with_check(check)
+        .with_matching(matching)
         .with_detail(detail)
         .with_poses(poses);
     options.fit.steps = args.fit.unwrap_or(options.fit.steps);

@@ -47,9 +47,11 @@ impl Options {
     /// [`Reconstructor::run`](subsplat::reconstruct::Reconstructor::run), and every baseline that differs
     /// from the others at this `upscale`.
     pub fn new(upscale: f32) -> Self {
-        use Method::{Backbone, Bilinear, Copy, Fit, Lowpass, Mean, Refine, Subsplat, Uniform};
+        use Method::{
+            Backbone, Bilinear, Copy, Enlarged, Fit, Lowpass, Mean, Refine, Subsplat, Uniform,
+        };
         let methods = if upscale > 1.0 {
-            vec![Subsplat, Fit, Refine, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean]
+            vec![Subsplat, Fit, Refine, Enlarged, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean]
         } else {
             vec![Subsplat, Fit, Refine, Backbone, Copy, Mean]
         };

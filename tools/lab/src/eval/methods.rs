@@ -17,9 +17,14 @@ pub enum Method {
     Detail,
     /// The model with detail, fitted to the photographs ([`subsplat::finish::fit()`]).
     Fit,
-    /// [`Method::Fit`], refined on the photographs ([`subsplat::finish::refine()`]): what `subsplat run`
-    /// gives.
+    /// What `subsplat run` gives: parents at the depth at which the photographs agree, optimised on the
+    /// photographs of the input's size; their children with detail, fitted and refined
+    /// ([`subsplat::finish::refine()`]).
     Refine,
+    /// [`Method::Refine`] without the match of depths between the photographs.
+    Unmatched,
+    /// [`Method::Fit`], refined on the photographs: the parents stay as predicted.
+    Direct,
     /// The model with detail on the two inputs nearest to the target alone.
     Pair,
     /// The Gaussians of [`Method::Detail`] at full density, without those of the least opacities: as
@@ -33,6 +38,9 @@ pub enum Method {
     Lowpass,
     /// The backbone's Gaussians rendered at the input's size, then enlarged bilinearly.
     Bilinear,
+    /// The backbone's Gaussians, fitted to and refined on the photographs of the input's size, rendered at
+    /// that size, then enlarged by Lanczos: the strongest picture without children.
+    Enlarged,
     /// K = r² equal children of each of the backbone's Gaussians, evenly over its pixel:
     /// SubSplat's split with untrained heads. The paper's Table D trains a backbone with K
     /// Gaussians a pixel instead (`gaussians_per_pixel` of its configuration); score its weights
@@ -52,17 +60,20 @@ pub enum Method {
 }
 
 /// Names of the methods that need no files, in the order of the tables.
-pub(crate) const NAMED: [(&str, Method); 13] = [
+pub(crate) const NAMED: [(&str, Method); 16] = [
     ("subsplat", Method::Subsplat),
     ("detail", Method::Detail),
     ("fit", Method::Fit),
     ("refine", Method::Refine),
+    ("unmatched", Method::Unmatched),
+    ("direct", Method::Direct),
     ("pair", Method::Pair),
     ("opaque", Method::Opaque),
     ("random", Method::Random),
     ("backbone", Method::Backbone),
     ("lowpass", Method::Lowpass),
     ("bilinear", Method::Bilinear),
+    ("enlarged", Method::Enlarged),
     ("uniform", Method::Uniform),
     ("copy", Method::Copy),
     ("mean", Method::Mean),

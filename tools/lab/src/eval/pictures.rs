@@ -4,6 +4,7 @@ use super::Method;
 use super::evaluator::{Crops, Options};
 use super::methods::{enlarged, mean, nearest};
 use std::ops::ControlFlow;
+use subsplat::files::photos::resize::{Filter, resize};
 use subsplat::finish::{FitOptions, PhaseRun};
 use subsplat::network::config::LowpassRef;
 use subsplat::network::model::scene_encoding::SceneEncoding;
@@ -12,7 +13,8 @@ use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::reconstruct::stages::{
-    SceneChildren, add_detail, counts_of, fit_to_inputs, refine_on_inputs,
+    SceneChildren, add_detail, counts_of, fit_to_inputs, match_parents, options_of_parents,
+    refine_on_inputs, refine_parents,
 };
 use subsplat::reconstruct::{Density, DepthBounds, Error, Reconstructor, Refine, Result};
 use subsplat::scene::pictures::Rgb;
@@ -59,7 +61,10 @@ enum Set {
     Children,
     Detailed,
     Fitted,
-    Refined,
+    /// Refined children of parents that were prepared before.
+    Refined(Parents),
+    /// Parents, refined on the photographs of the input's size.
+    RefinedParents,
     /// The children of two inputs alone, with detail.
     Pair([usize; 2]),
     Opaque,
@@ -69,7 +74,18 @@ enum Set {
 }
 
 /// Sets of which each is made of the one before it.
-const REFINED_IN_ORDER: [Set; 4] = [Set::Children, Set::Detailed, Set::Fitted, Set::Refined];
+const IN_ORDER: [Set; 3] = [Set::Children, Set::Detailed, Set::Fitted];
+
+/// What happens to parents before they are divided.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Parents {
+    /// Depth is matched, and they are refined on the photographs of the input's size.
+    Matched,
+    /// They are refined on the photographs of the input's size.
+    Refined,
+    /// Nothing.
+    Predicted,
+}
 
 impl Set {
     /// The set of `method` for a picture seen by `camera`.
@@ -78,7 +94,10 @@ impl Set {
             Method::Subsplat => Some(Self::Children),
             Method::Detail => Some(Self::Detailed),
             Method::Fit => Some(Self::Fitted),
-            Method::Refine => Some(Self::Refined),
+            Method::Refine => Some(Self::Refined(Parents::Matched)),
+            Method::Unmatched => Some(Self::Refined(Parents::Refined)),
+            Method::Direct => Some(Self::Refined(Parents::Predicted)),
+            Method::Enlarged => Some(Self::RefinedParents),
             Method::Pair => nearest_two(inputs, camera).map(Self::Pair),
             Method::Opaque => Some(Self::Opaque),
             Method::Random => Some(Self::Random),
@@ -156,31 +175,31 @@ impl<'a> PictureMaker<'a> {
             return Ok(());
         }
         let begin = Instant::now();
-        let place = |set: Set| REFINED_IN_ORDER.iter().position(|s| *s == set);
+        let place = |set: Set| IN_ORDER.iter().position(|s| *s == set);
         let mut before = 0.0;
         let (from, to) = (self.current.and_then(place), place(set));
         let splats = match (from, to, self.splats.take()) {
             (Some(from), Some(to), Some(splats)) if from < to => {
                 before = self.set_seconds;
-                self.refined(network, splats, crops, &REFINED_IN_ORDER[from + 1..=to])?
+                self.refined(network, splats, crops, &IN_ORDER[from + 1..=to])?
             }
             (_, Some(to), _) => {
                 let raster = self.raster_options(network, 1.0, None);
-                let children = network.children(&crops.inputs, self.density, &raster)?;
-                self.refined(network, children, crops, &REFINED_IN_ORDER[1..=to])?
+                let encoding = network.encoding();
+                let children = network.children(&encoding, &crops.inputs, self.density, &raster)?;
+                self.refined(network, children, crops, &IN_ORDER[1..=to])?
             }
-            (_, None, _) => SceneChildren::of_splats(match set {
-                Set::Pair(pair) => network.splats_of_pair(pair, crops)?,
-                Set::Opaque | Set::Random => self.reduced(network, crops, set)?,
-                _ => network.splats(set, self.upscale.ceil() as usize)?,
-            }),
+            (_, None, _) => match set {
+                Set::Refined(parents) => self.finished(network, crops, parents)?,
+                set => SceneChildren::of_splats(self.baseline(network, crops, set)?),
+            },
         };
         self.set_seconds = before + begin.elapsed().as_secs_f64();
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())
     }
 
-    /// Takes `splats` through the steps `sets` of [`REFINED_IN_ORDER`].
+    /// Takes `splats` through the steps `sets` of [`IN_ORDER`].
     fn refined(
         &self,
         network: &Network<'_>,
@@ -204,24 +223,93 @@ impl<'a> PictureMaker<'a> {
                     let splats = &mut children.splats;
                     fit_to_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
                 }
-                _ => {
-                    // As `run`: none of more Gaussians than `Auto` refines.
-                    let SceneChildren { splats, groups, .. } = &mut children;
-                    let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
-                    let (raster, how) = (&raster, &options);
-                    let mut progress = |_: &PhaseRun<'_>| ControlFlow::Continue(());
-                    refine_on_inputs(splats, groups, inputs, raster, how, renderer, &mut progress)?;
-                }
+                _ => {}
             }
         }
         Ok(children)
+    }
+
+    /// The Gaussians of a baseline.
+    fn baseline(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
+        match set {
+            Set::RefinedParents => self.refined_parents(network, crops),
+            Set::Pair(pair) => network.splats_of_pair(pair, crops),
+            Set::Opaque | Set::Random => self.reduced(network, crops, set),
+            _ => network.splats(set, self.upscale.ceil() as usize),
+        }
+    }
+
+    /// The Gaussians that `run` makes, of `parents`.
+    fn finished(
+        &self,
+        network: &Network<'_>,
+        crops: &Crops,
+        parents: Parents,
+    ) -> Result<SceneChildren> {
+        let inputs = &crops.inputs;
+        let mut renderer = Renderer::default();
+        let small = self.raster_options(network, 1.0, None);
+        let mut encoding = network.encoding();
+        let upscale = network.model.config().upscale;
+        let model = network.model.model();
+        let mut own = encoding.parents(model)?;
+        let mut part = |_: f32| ControlFlow::Continue(());
+        if parents == Parents::Matched {
+            let near_far = self.bounds.near_far();
+            match_parents(&mut own, inputs, near_far, &mut part)?;
+        }
+        let expected = self.density.limit(own.len(), inputs.len(), upscale);
+        let options = Refine::Auto.options_for(inputs.len(), expected, true);
+        let options =
+            options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
+        if let Some(options) = options {
+            refine_parents(&mut own, inputs, &small, &options, &mut renderer, &mut part)?;
+        }
+        encoding = encoding.with_parents(model, &own)?;
+        let mut children = network.children(&encoding, inputs, self.density, &small)?;
+        children.add_offsets(&own);
+        let mut children = self.refined(network, children, crops, &IN_ORDER[1..])?;
+        let SceneChildren { splats, groups, .. } = &mut children;
+        let raster = self.raster_options(network, self.upscale, None);
+        // As `run`: none of more Gaussians than `Auto` refines.
+        let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
+        let mut step = |_: &PhaseRun<'_>| ControlFlow::Continue(());
+        let renderer = &mut renderer;
+        refine_on_inputs(splats, groups, inputs, &raster, &options, renderer, &mut step)?;
+        Ok(children)
+    }
+
+    /// The network's Gaussians, one a pixel, fitted to and refined on the photographs of the input's size.
+    fn refined_parents(&self, network: &Network<'_>, crops: &Crops) -> Result<Splats> {
+        let small = self.raster_options(network, 1.0, None);
+        let smaller = |c: &Cropped| Cropped {
+            target: c.input.clone(),
+            target_camera: c.input_camera,
+            ..c.clone()
+        };
+        let inputs: Vec<Cropped> = crops.inputs.iter().map(smaller).collect();
+        let mut children = SceneChildren::of_splats(network.splats(Set::Parents, 1)?);
+        let mut renderer = Renderer::default();
+        let renderer = &mut renderer;
+        let options = FitOptions::default();
+        let mut step = |_: usize| ControlFlow::Continue(());
+        fit_to_inputs(&mut children.splats, &inputs, &small, &options, renderer, &mut step)?;
+        let size = children.splats.len() / inputs.len().max(1);
+        children.groups.ranges = (0..inputs.len()).map(|v| v * size..(v + 1) * size).collect();
+        children.groups.equal_families = true;
+        let SceneChildren { splats, groups, .. } = &mut children;
+        let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
+        let mut step = |_: &PhaseRun<'_>| ControlFlow::Continue(());
+        refine_on_inputs(splats, groups, &inputs, &small, &options, renderer, &mut step)?;
+        Ok(children.splats)
     }
 
     /// The Gaussians of [`Set::Detailed`] at full density, as many as the density allows: those of
     /// the highest opacities ([`Set::Opaque`]), or random ones.
     fn reduced(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
         let raster = self.raster_options(network, 1.0, None);
-        let mut children = network.children(&crops.inputs, Density::Full, &raster)?;
+        let encoding = network.encoding();
+        let mut children = network.children(&encoding, &crops.inputs, Density::Full, &raster)?;
         let upscale = network.model.config().upscale;
         children.add_detail(&crops.inputs, upscale)?;
         let splats = children.splats;
@@ -248,6 +336,12 @@ impl<'a> PictureMaker<'a> {
             Method::Mean => mean(&crops.inputs, size),
             Method::Lowpass => self.render(camera, r, Some(LowpassRef::Input)),
             Method::Backbone => self.render(camera, r, Some(LowpassRef::Target)),
+            Method::Enlarged => {
+                let small = self.render(&target.input_camera, 1.0, None);
+                let (w, h) = (target.input.width, target.input.height);
+                let Some(small) = Rgb::from_unit(&small, w, h) else { return Vec::new() };
+                resize(&small, size.0, size.1, Filter::Lanczos).to_unit()
+            }
             Method::Bilinear => {
                 let small = self.render(&target.input_camera, 1.0, None);
                 enlarged(&small, (target.input.width, target.input.height), size)
@@ -282,19 +376,23 @@ impl<'a> PictureMaker<'a> {
 }
 
 impl Network<'_> {
-    /// The model's Gaussians, without detail. `raster` renders pictures of the input's size.
+    /// The backbone's outputs and the primaries.
+    fn encoding(&self) -> SceneEncoding {
+        SceneEncoding::new(self.views.clone(), self.output.clone(), self.parents.clone())
+    }
+
+    /// The model's Gaussians of the primaries in `encoding`, without detail. `raster` renders pictures of the input's size.
     fn children(
         &self,
+        encoding: &SceneEncoding,
         inputs: &[Cropped],
         density: Density,
         raster: &RasterOptions,
     ) -> Result<SceneChildren> {
-        let Self { views, output, parents, .. } = self;
         let network = self.model.model();
-        let encoding = SceneEncoding::new(views.clone(), output.clone(), parents.clone());
         let mut renderer = Renderer::default();
-        let counts = counts_of(network, &encoding, inputs, density, raster, &mut renderer)?;
-        Ok(SceneChildren::new(network, &encoding, inputs.len(), counts, &|| Ok(()))?)
+        let counts = counts_of(network, encoding, inputs, density, raster, &mut renderer)?;
+        Ok(SceneChildren::new(network, encoding, inputs.len(), counts, &|| Ok(()))?)
     }
 
     /// Gaussians of a baseline.

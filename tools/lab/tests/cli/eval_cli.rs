@@ -30,8 +30,8 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     let out = place.path().join("out");
     let report = done(&call_in(place.path(), "--json eval scene --detail photo -o out"));
     let names = [
-        "subsplat", "detail", "fit", "refine", "backbone", "lowpass", "bilinear", "uniform",
-        "copy", "mean",
+        "subsplat", "detail", "fit", "refine", "enlarged", "backbone", "lowpass", "bilinear",
+        "uniform", "copy", "mean",
     ];
     let methods = report["methods"].as_object().unwrap();
     assert_eq!(methods.len(), names.len());
@@ -56,7 +56,7 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     let mean = 0.5 * (psnr(&scene["cases"][0]) + psnr(case));
     assert!((psnr(scene) - mean).abs() < 1e-9 && (psnr(&report) - mean).abs() < 1e-9);
 
-    // 3 targets of 10 methods and the truth; four tables; nothing else.
+    // 3 targets of 11 methods and the truth; four tables; nothing else.
     let written = files(&out);
     assert_eq!(written.len(), 3 * 11 + 4, "{written:?}");
     let saved: Value = serde_json::from_str(&text(&out.join("eval.json"))).unwrap();

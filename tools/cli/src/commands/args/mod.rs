@@ -27,8 +27,8 @@ pub use render::RenderArgs;
 pub use rendering::{ConventionArg, LowpassArg, MotionArgs, PATH_FRAMES, PathArg, RenderingArgs};
 pub use run::RunArgs;
 pub use source::{
-    BackboneArg, CropShapeArg, DetailArg, InputSizeArg, ModelArgs, PresetArg, QualityArg,
-    SourceArgs,
+    BackboneArg, CropShapeArg, DetailArg, InputSizeArg, MatchingArg, ModelArgs, PresetArg,
+    QualityArg, SourceArgs,
 };
 
 use super::values;

@@ -113,6 +113,18 @@ pub struct SourceArgs {
         help_heading = QUALITY
     )]
     pub refine: Option<Refine>,
+    /// Correction of the network's distances by comparing patches of the photographs.
+    ///
+    /// Objects then lie where the photographs agree, and new views are sharper and less distorted.
+    /// Without --fit and --refine the network's distances stay.
+    #[arg(
+        long,
+        value_enum,
+        default_value = "photo",
+        hide_short_help = true,
+        help_heading = QUALITY
+    )]
+    pub matching: MatchingArg,
     /// Source of fine texture.
     #[arg(
         long,
@@ -229,6 +241,15 @@ pub enum CropShapeArg {
     Whole,
     /// The square in the middle.
     Square,
+}
+
+/// Correction of the network's distances.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MatchingArg {
+    /// None: the network's own distances.
+    Off,
+    /// Each pixel moves to the distance at which the photographs agree, where they do.
+    Photo,
 }
 
 /// Source of colour detail.

@@ -1,7 +1,9 @@
 //! Arguments of `view`, and its keys.
 
 use super::groups::{PICTURES, SIZE};
-use super::{ConventionArg, CropShapeArg, DetailArg, QualityArg, RenderingArgs, SourceArgs};
+use super::{
+    ConventionArg, CropShapeArg, DetailArg, MatchingArg, QualityArg, RenderingArgs, SourceArgs,
+};
 use crate::commands::values;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
@@ -144,6 +146,7 @@ impl ViewArgs {
             (source.input_size.is_some(), "--input-size"),
             (source.gaussians.is_some(), "--gaussians"),
             (source.crop != CropShapeArg::Whole, "--crop"),
+            (source.matching != MatchingArg::Photo, "--matching"),
             (source.detail != DetailArg::Photo, "--detail"),
             (source.fit.is_some(), "--fit"),
             (source.refine.is_some(), "--refine"),
