@@ -314,7 +314,7 @@ impl Reconstructor {
             _ => options.refine_options(photos, gaussians).steps as f32,
         };
         let matches = options.matches_depth();
-        let refinement_of_parents = 15.0 / 4.0 * refinement;
+        let refinement_of_parents = 2.0 * refinement;
         let costs = [
             (Stage::Poses, if options.poses == Poses::Adjusted { 0.3 * n } else { 0.0 }),
             (Stage::Crop, 0.015 * n),
@@ -322,7 +322,7 @@ impl Reconstructor {
             (Stage::DepthRange, if estimates { 0.03 * pixels } else { 0.0 }),
             (Stage::Backbone, if mvsplat { 0.8 } else { 0.12 } * pixels),
             (Stage::Primaries, 0.01 * pixels),
-            (Stage::Matching, if matches { 0.15 * pixels } else { 0.0 }),
+            (Stage::Matching, if matches { 0.05 * pixels * n.min(4.0) } else { 0.0 }),
             (Stage::Parents, FIT_STEP * refinement_of_parents / n * pixels / 4.0),
             (Stage::Subsplat, if aggregates { 0.25 } else { 0.06 } * pixels),
             (Stage::Detail, if options.detail == Detail::Off { 0.0 } else { 0.01 * pixels }),

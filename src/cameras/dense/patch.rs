@@ -85,6 +85,8 @@ pub(super) struct Patch {
     centre: [f32; 2],
     values: [f32; PADDED],
     weights: [f32; PADDED],
+    /// Sum of the weights.
+    weight: f32,
 }
 
 impl Patch {
@@ -104,11 +106,12 @@ impl Patch {
     #[inline(always)]
     pub fn new(picture: &GrayImage, x: usize, y: usize, of: &[f32; SAMPLES]) -> Self {
         let (mut values, mut weights) = ([0.0; PADDED], [0.0; PADDED]);
-        for i in 0..SAMPLES {
-            values[i] = sample(picture, x, y, i).unwrap_or(0.0);
+        for (i, value) in values.iter_mut().enumerate().take(SAMPLES) {
+            *value = sample(picture, x, y, i).unwrap_or(0.0);
         }
         weights[..SAMPLES].copy_from_slice(of);
-        Self { centre: [x as f32 + 0.5, y as f32 + 0.5], values, weights }
+        let weight = of.iter().sum();
+        Self { centre: [x as f32 + 0.5, y as f32 + 0.5], values, weights, weight }
     }
 
     /// 1 − the weighted correlation of the patch, which lies on the plane of inverse depth `inverse` with
@@ -122,58 +125,79 @@ impl Patch {
         slopes: [f32; 2],
     ) -> f32 {
         let [x, y] = self.centre;
-        let affine = [0, 1, 2].map(|i| {
-            let (a, b) = (&warp.a[i], warp.b[i]);
+        let mut affine = [[0.0; 3]; 3];
+        for ((to, a), b) in affine.iter_mut().zip(&warp.a).zip(&warp.b) {
             let at = a[0] * x + a[1] * y + a[2] + b * inverse;
-            [at, a[0] + b * slopes[0], a[1] + b * slopes[1]]
-        });
-        let [right, bottom] = [source.width() - 1, source.height() - 1].map(|v| v as f32);
-        let (mut columns, mut rows, mut weights) =
-            ([0.0f32; PADDED], [0.0f32; PADDED], [0.0f32; PADDED]);
+            *to = [at, a[0] + b * slopes[0], a[1] + b * slopes[1]];
+        }
+        let [us, vs, ws] = affine;
+        let right = (source.width() - 1) as f32;
+        let bottom = (source.height() - 1) as f32;
+        // The last column and row are reached from those before.
+        let left_max = (right - 1.0).max(0.0);
+        let top_max = (bottom - 1.0).max(0.0);
+        let width = source.width() as i32;
+        let (mut weights, mut corners) = ([0.0f32; PADDED], [0u32; PADDED]);
+        let (mut across, mut down) = ([0.0f32; PADDED], [0.0f32; PADDED]);
         for i in 0..PADDED {
-            let [u, v, w] = affine.map(|[at, dx, dy]| at + dx * X_OFFSETS[i] + dy * Y_OFFSETS[i]);
+            let (dx, dy) = (X_OFFSETS[i], Y_OFFSETS[i]);
+            let u = us[0] + us[1] * dx + us[2] * dy;
+            let v = vs[0] + vs[1] * dx + vs[2] * dy;
+            let w = ws[0] + ws[1] * dx + ws[2] * dy;
             // Pixel centres are at +0.5.
             let column = u / w - 0.5;
             let row = v / w - 0.5;
-            let shown =
-                w > DEPTH_MIN && column >= 0.0 && column <= right && row >= 0.0 && row <= bottom;
+            let inside = column >= 0.0 && column <= right && row >= 0.0 && row <= bottom;
+            let shown = w > DEPTH_MIN && inside;
             weights[i] = if shown { self.weights[i] } else { 0.0 };
-            columns[i] = if shown { column } else { 0.0 };
-            rows[i] = if shown { row } else { 0.0 };
+            let column = if shown { column } else { 0.0 };
+            let row = if shown { row } else { 0.0 };
+            // Neither is negative, so that the conversion rounds down.
+            let left = column.min(left_max) as i32;
+            let top = row.min(top_max) as i32;
+            across[i] = column - left as f32;
+            down[i] = row - top as f32;
+            corners[i] = (top * width + left) as u32;
         }
-        let mut found = [0.0f32; PADDED];
-        let (pixels, width) = (source.pixels(), source.width());
+        let mut corner_values = [[0.0f32; PADDED]; 4];
+        let (pixels, below) = (source.pixels(), source.pixels().get(source.width()..));
+        let below = below.filter(|below| !below.is_empty()).unwrap_or(pixels);
         for i in 0..SAMPLES {
-            // The last column and row are reached from those before.
-            let left = (columns[i] as usize).min(width.saturating_sub(2));
-            let top = (rows[i] as usize).min(source.height().saturating_sub(2));
-            let (fx, fy) = (columns[i] - left as f32, rows[i] - top as f32);
-            let at = top * width + left;
-            let (Some([a, b]), Some([c, d])) = (
-                pixels[at..].first_chunk(),
-                pixels.get(at + width..).and_then(<[f32]>::first_chunk),
-            ) else {
+            let at = corners[i] as usize;
+            let (Some(&[a, b]), Some(&[c, d])) =
+                (pixels[at..].first_chunk(), below[at.min(below.len() - 1)..].first_chunk())
+            else {
                 return HIDDEN;
             };
-            let upper = a + fx * (b - a);
-            let lower = c + fx * (d - c);
-            found[i] = upper + fy * (lower - upper);
+            corner_values[0][i] = a;
+            corner_values[1][i] = b;
+            corner_values[2][i] = c;
+            corner_values[3][i] = d;
         }
-        let mut sums = [[0.0f32; SUMS]; 7];
+        let mut sums = [[0.0f32; SUMS]; 6];
         for i in (0..PADDED).step_by(SUMS) {
             for j in 0..SUMS {
-                let (w, own, other) = (weights[i + j], self.values[i + j], found[i + j]);
+                let (a, c) = (corner_values[0][i + j], corner_values[2][i + j]);
+                let upper = a + across[i + j] * (corner_values[1][i + j] - a);
+                let lower = c + across[i + j] * (corner_values[3][i + j] - c);
+                let other = upper + down[i + j] * (lower - upper);
+                let (w, own) = (weights[i + j], self.values[i + j]);
                 sums[0][j] += w;
                 sums[1][j] += w * own;
                 sums[2][j] += w * other;
                 sums[3][j] += w * own * own;
                 sums[4][j] += w * other * other;
                 sums[5][j] += w * own * other;
-                sums[6][j] += self.weights[i + j];
             }
         }
-        let [weight, own, other, own2, other2, both, all] = sums.map(|s| s.iter().sum::<f32>());
-        if !(weight > SHOWN_MIN * all) {
+        let mut totals = [0.0f32; 6];
+        for (total, sums) in totals.iter_mut().zip(&sums) {
+            for sum in sums {
+                *total += sum;
+            }
+        }
+        let [weight, own, other, own2, other2, both] = totals;
+        if !(weight > SHOWN_MIN * self.weight) {
             return HIDDEN;
         }
         let mean = [own / weight, other / weight];

@@ -8,22 +8,10 @@ use subsplat_kernels::cpu::simd::vectorize;
 use subsplat_kernels::layout::random::{GOLDEN, mix};
 
 /// Rounds over all pixels.
-const ROUNDS: usize = 6;
+const ROUNDS: usize = 4;
 /// Neighbours whose planes a pixel tries, px. All have the other colour of the chessboard.
-const NEIGHBOURS: [[isize; 2]; 12] = [
-    [1, 0],
-    [-1, 0],
-    [0, 1],
-    [0, -1],
-    [5, 0],
-    [-5, 0],
-    [0, 5],
-    [0, -5],
-    [2, 3],
-    [-2, -3],
-    [3, -2],
-    [-3, 2],
-];
+const NEIGHBOURS: [[isize; 2]; 8] =
+    [[1, 0], [-1, 0], [0, 1], [0, -1], [5, 0], [-5, 0], [0, 5], [0, -5]];
 /// The first of [`NEIGHBOURS`] that touch the pixel.
 const TOUCHING: usize = 4;
 /// Cost of a pixel whose touching neighbours all have another depth.
@@ -35,6 +23,8 @@ const OTHER_DEPTH: f32 = 0.02;
 const FIRST_SLOPE_MAX: f32 = 0.03;
 /// Planes that differ by less, relative to the inverse depth, in the pixel and across the patch are one.
 const SAME_PLANE: f32 = 2e-5;
+/// Pixels from the middle of the patch to its border.
+const SAME_PLANE_REACH: f32 = 4.0;
 /// Changes at random, relative to the inverse depth: of itself and of the slopes a pixel. The first two halve with
 /// each round.
 const CHANGES: [[f32; 2]; 3] = [[0.2, 0.0], [0.01, 0.01], [0.002, 0.003]];
@@ -56,16 +46,27 @@ pub(super) struct Plane {
 
 impl Plane {
     /// The plane of a pixel that is (dx, dy) away.
+    #[inline(always)]
     fn moved(self, [dx, dy]: [isize; 2]) -> Self {
         let inverse = self.inverse + self.slopes[0] * dx as f32 + self.slopes[1] * dy as f32;
         Self { inverse, ..self }
     }
 
+    #[inline(always)]
     fn is_nearly(&self, other: &Self) -> bool {
-        let most = SAME_PLANE * self.inverse.abs();
-        let differs = |a: f32, b: f32| (a - b).abs() > most;
-        let [a, b] = [self, other].map(|p| p.slopes.map(|s| SAMPLES as f32 * s));
-        !(differs(self.inverse, other.inverse) || differs(a[0], b[0]) || differs(a[1], b[1]))
+        let reach = SAME_PLANE_REACH * (self.slopes[0] - other.slopes[0]).abs()
+            + SAME_PLANE_REACH * (self.slopes[1] - other.slopes[1]).abs();
+        (self.inverse - other.inverse).abs() + reach <= SAME_PLANE * self.inverse.abs()
+    }
+
+    /// The plane after change `k` of [`CHANGES`] by three numbers from −1 to 1.
+    #[inline(always)]
+    fn changed(&self, k: usize, round: usize, noise: [f32; 3]) -> Self {
+        let scale = if k < HALVING { 0.5f32.powi(round as i32) } else { 1.0 };
+        let depth = scale * CHANGES[k][0];
+        let slope = scale * CHANGES[k][1] * self.inverse;
+        let slopes = [self.slopes[0] + slope * noise[1], self.slopes[1] + slope * noise[2]];
+        Self { inverse: self.inverse * (1.0 + depth * noise[0]), slopes, ..*self }
     }
 }
 
@@ -169,59 +170,63 @@ impl Comparison<'_> {
         if self.others.len() > 2 { 0.5 * (best[0] + best[1]) } else { best[0] }
     }
 
-    /// The best plane of pixel `i` among its own, its neighbours' and changes of it.
+    /// The best plane of pixel `i` among its own, its neighbours' and changes of it. One loop evaluates all
+    /// of them, so that the evaluation is compiled once and with the vectors of the caller.
     #[inline(always)]
     fn better(&self, i: usize, field: &[Plane], round: usize) -> Plane {
         let (width, height) = (self.picture.width(), self.picture.height());
         let (x, y) = (i % width, i / width);
-        let neighbours = NEIGHBOURS.map(|[dx, dy]| {
-            let column = x.checked_add_signed(dx).filter(|column| *column < width)?;
-            let row = y.checked_add_signed(dy).filter(|row| *row < height)?;
-            Some(field[row * width + column].moved([-dx, -dy]))
-        });
-        let roughness = |inverse: f32| {
-            let touching = neighbours[..TOUCHING].iter().flatten();
-            let other = |p: &Plane| ((p.inverse / inverse - 1.0).abs() / OTHER_DEPTH).min(1.0);
-            ROUGHNESS_COST * touching.map(other).sum::<f32>() / TOUCHING as f32
-        };
-        let patch = self.patch(i);
         let mut best = field[i];
-        let mut cost = best.difference + roughness(best.inverse);
-        let mut take = |plane: Plane, best: &mut Plane| {
-            let rough = roughness(plane.inverse);
+        let mut neighbours = [None; NEIGHBOURS.len()];
+        for (to, [dx, dy]) in neighbours.iter_mut().zip(NEIGHBOURS) {
+            let (Some(column), Some(row)) = (x.checked_add_signed(dx), y.checked_add_signed(dy))
+            else {
+                continue;
+            };
+            if column < width && row < height {
+                *to = Some(field[row * width + column].moved([-dx, -dy]));
+            }
+        }
+        let patch = self.patch(i);
+        let mut cost = best.difference + roughness(&neighbours, best.inverse);
+        for k in 0..NEIGHBOURS.len() + CHANGES.len() {
+            let plane = match (neighbours.get(k), k.checked_sub(NEIGHBOURS.len())) {
+                (Some(Some(neighbour)), _) => *neighbour,
+                (_, Some(k)) => {
+                    let seed = ((self.view * ROUNDS + round) * CHANGES.len() + k) as u64;
+                    best.changed(k, round, noise((seed << 40) | i as u64))
+                }
+                _ => continue,
+            };
+            let rough = roughness(&neighbours, plane.inverse);
             // No difference is below 0.
-            if rough >= cost || plane.is_nearly(best) {
-                return;
+            if rough >= cost || plane.is_nearly(&best) {
+                continue;
             }
             let difference = self.difference(&patch, &plane);
             if difference + rough < cost {
                 cost = difference + rough;
-                *best = Plane { difference, ..plane };
+                best = Plane { difference, ..plane };
             }
-        };
-        for plane in neighbours.iter().flatten() {
-            take(*plane, &mut best);
-        }
-        for (k, [depth, slope]) in CHANGES.into_iter().enumerate() {
-            let scale = if k < HALVING { 0.5f32.powi(round as i32) } else { 1.0 };
-            let seed = ((self.view * ROUNDS + round) * CHANGES.len() + k) as u64;
-            let [a, b, c] = noise((seed << 40) | i as u64);
-            let slopes = [
-                best.slopes[0] + best.inverse * slope * scale * b,
-                best.slopes[1] + best.inverse * slope * scale * c,
-            ];
-            take(
-                Plane { inverse: best.inverse * (1.0 + depth * scale * a), slopes, ..best },
-                &mut best,
-            );
         }
         best
     }
+}
+
+/// Cost of a pixel whose touching neighbours, the first of `neighbours`, have other inverse depths.
+#[inline(always)]
+fn roughness(neighbours: &[Option<Plane>], inverse: f32) -> f32 {
+    let mut sum = 0.0;
+    for plane in neighbours[..TOUCHING].iter().flatten() {
+        sum += ((plane.inverse / inverse - 1.0).abs() / OTHER_DEPTH).min(1.0);
+    }
+    ROUGHNESS_COST * sum / TOUCHING as f32
 }
 
 /// Three numbers from −1 to 1.
 #[inline(always)]
 fn noise(seed: u64) -> [f32; 3] {
     let bits = mix(seed.wrapping_mul(GOLDEN).wrapping_add(GOLDEN));
-    [0, 21, 42].map(|shift| ((bits >> shift) & 0x1f_ffff) as f32 / (1u64 << 20) as f32 - 1.0)
+    let number = |shift: u32| ((bits >> shift) & 0x1f_ffff) as f32 / (1u32 << 20) as f32 - 1.0;
+    [number(0), number(21), number(42)]
 }

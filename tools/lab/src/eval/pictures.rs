@@ -262,7 +262,10 @@ impl<'a> PictureMaker<'a> {
         let options = Refine::Auto.options_for(inputs.len(), expected, true);
         let options =
             options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
-        if let Some(options) = options {
+        if let Some(mut options) = options {
+            if let Ok(v) = std::env::var("PS") {
+                options.steps = v.parse().unwrap_or(60);
+            }
             refine_parents(&mut own, inputs, &small, &options, &mut renderer, &mut part)?;
         }
         encoding = encoding.with_parents(model, &own)?;
