@@ -106,9 +106,9 @@ impl Prepared<'_> {
         let raster_at = |ratio: f32| config.raster_options(ratio, bounds.near, colour);
         let mut renderer = Renderer::new(model.backend());
         let density = options.density;
-        let per_scene = encoding.per_view() * inputs.len();
-        let expected = density.limit(per_scene, inputs.len(), config.upscale);
-        let scene_options = options.refine_options(inputs.len(), expected);
+        // More children than `Refine::Auto` allows are not refined, but their parents are.
+        let count = encoding.per_view() * inputs.len();
+        let scene_options = options.refine_options(inputs.len(), count);
         let parents_options = options_of_parents(&scene_options, &inputs);
         let mut factors = Vec::new();
         let mut parents = None;

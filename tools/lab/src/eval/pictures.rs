@@ -250,7 +250,6 @@ impl<'a> PictureMaker<'a> {
         let mut renderer = Renderer::default();
         let small = self.raster_options(network, 1.0, None);
         let mut encoding = network.encoding();
-        let upscale = network.model.config().upscale;
         let model = network.model.model();
         let mut own = encoding.parents(model)?;
         let mut part = |_: f32| ControlFlow::Continue(());
@@ -258,8 +257,7 @@ impl<'a> PictureMaker<'a> {
             let near_far = self.bounds.near_far();
             match_parents(&mut own, inputs, near_far, &mut part)?;
         }
-        let expected = self.density.limit(own.len(), inputs.len(), upscale);
-        let options = Refine::Auto.options_for(inputs.len(), expected, true);
+        let options = Refine::Auto.options_for(inputs.len(), own.len(), true);
         let options =
             options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
         if let Some(mut options) = options {
