@@ -45,6 +45,10 @@ pub struct Options {
     /// Refinement of the Gaussians on the photographs ([`crate::finish::refine()`]). Default:
     /// [`Refine::Auto`].
     pub refine: Refine,
+    /// Length of the optimisation of the primaries before they are divided, as that of a scene which is
+    /// refined so: for a scene that is refined later ([`Reconstruction::refine`](super::Reconstruction::refine)).
+    /// Default: none, which stands for [`Options::refine`].
+    pub parents: Option<Refine>,
 }
 
 impl Options {
@@ -149,6 +153,13 @@ impl Options {
         self
     }
 
+    /// Sets [`Options::parents`].
+    #[must_use]
+    pub fn with_parents(mut self, parents: impl Into<Option<Refine>>) -> Self {
+        self.parents = parents.into();
+        self
+    }
+
     /// Size of the network's input for photographs of the sizes `photos` and a model of `stride`, px,
     /// whose pixels have `upscale`² Gaussians.
     pub fn input_size_for(&self, photos: &[Size], stride: usize, upscale: usize) -> Size {
@@ -157,6 +168,12 @@ impl Options {
             _ => photos,
         };
         self.input_size.limited_to(shapes, upscale).resolve(shapes, stride)
+    }
+
+    /// Options of the refinement on which that of `parents` primaries depends.
+    pub(super) fn parents_options(&self, photographs: usize, parents: usize) -> RefineOptions {
+        let refine = self.parents.unwrap_or(self.refine);
+        refine.options_for(photographs, parents, self.fit.steps > 0)
     }
 
     /// Returns whether depth is matched: not where the Gaussians are to stay the network's.

@@ -108,7 +108,7 @@ impl Prepared<'_> {
         let density = options.density;
         // More children than `Refine::Auto` allows are not refined, but their parents are.
         let count = encoding.per_view() * inputs.len();
-        let scene_options = options.refine_options(inputs.len(), count);
+        let scene_options = options.parents_options(inputs.len(), count);
         let parents_options = options_of_parents(&scene_options, &inputs);
         let mut factors = Vec::new();
         let mut parents = None;

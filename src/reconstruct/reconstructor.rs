@@ -314,7 +314,10 @@ impl Reconstructor {
             _ => options.refine_options(photos, gaussians).steps as f32,
         };
         let matches = options.matches_depth();
-        let refinement_of_parents = 2.0 * refinement;
+        let refinement_of_parents = match options.parents.unwrap_or(options.refine) {
+            Refine::Seconds(seconds) => 2.0 * seconds as f32,
+            _ => 2.0 * options.parents_options(photos, parents).steps as f32,
+        };
         let costs = [
             (Stage::Poses, if options.poses == Poses::Adjusted { 0.3 * n } else { 0.0 }),
             (Stage::Crop, 0.015 * n),

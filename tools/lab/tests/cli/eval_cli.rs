@@ -58,11 +58,11 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
 
     // 3 targets of 11 methods and the truth; four tables; nothing else.
     let written = files(&out);
-    assert_eq!(written.len(), 3 * 11 + 4, "{written:?}");
+    assert_eq!(written.len(), 3 * 12 + 4, "{written:?}");
     let saved: Value = serde_json::from_str(&text(&out.join("eval.json"))).unwrap();
     assert_eq!((&saved["methods"], &saved["scenes"]), (&report["methods"], &report["scenes"]));
     let csv = text(&out.join("targets.csv"));
-    assert_eq!(csv.lines().count(), 1 + 3 * 10);
+    assert_eq!(csv.lines().count(), 1 + 3 * 11);
     assert!(csv.starts_with("scene,context,target,frame,method,psnr,ssim,lpips,sharpness,gmsd\n"));
     assert!(csv.lines().all(|l| l.matches(',').count() == 9), "{csv}");
     let means = text(&out.join("means.csv"));

@@ -136,6 +136,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let model = reconstruct::with_children(source, target, model, context.len(), sides)?;
     (options.input_size, options.target_size) = (size, target);
     // The window shows the scene while it is refined. A fixed number of frames shows the result.
+    options.parents = Some(options.refine);
     let refine = match args.frames {
         None => std::mem::replace(&mut options.refine, Refine::Off),
         Some(_) => Refine::Off,
