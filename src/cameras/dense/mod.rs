@@ -50,7 +50,7 @@ pub struct DenseMatch {
     pub certain: Vec<bool>,
 }
 
-/// Matches the depth of all `views`, within `near_far` widened by [`RANGE_MARGIN`]. `progress` receives
+/// Matches the depth of all `views`, within `near_far` widened by a factor of three. `progress` receives
 /// the share that is done. Returns `None` where it breaks. A view whose depth has another length than its picture, or
 /// that has no sources, stays as it is.
 pub fn match_depth(

@@ -213,7 +213,7 @@ fn difference(
 
 #[test]
 fn the_difference_is_that_of_its_definition() {
-    assert!(PADDED >= patch::SAMPLES);
+    const { assert!(PADDED >= patch::SAMPLES) };
     let cameras = cameras();
     let [(depth, picture), (_, source)] = [0, 1].map(|i| seen(&cameras[i], NORMAL));
     let warp = Warp::new(&cameras[0], &cameras[1]);
