@@ -66,12 +66,12 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     assert!(csv.starts_with("scene,context,target,frame,method,psnr,ssim,lpips,sharpness,gmsd\n"));
     assert!(csv.lines().all(|l| l.matches(',').count() == 9), "{csv}");
     let means = text(&out.join("means.csv"));
-    assert_eq!(means.lines().count(), 1 + 2 * 10);
+    assert_eq!(means.lines().count(), 1 + 2 * 11);
     assert!(means.lines().all(|l| l.matches(',').count() == 17), "{means}");
     let page = text(&out.join("index.html"));
-    // Two inputs, the photograph and ten methods, twice; nothing from elsewhere.
-    assert_eq!(page.matches("<img ").count(), 26);
-    assert_eq!(page.matches("src=\"data:image/png;base64,").count(), 26);
+    // Two inputs, the photograph and eleven methods, twice; nothing from elsewhere.
+    assert_eq!(page.matches("<img ").count(), 28);
+    assert_eq!(page.matches("src=\"data:image/png;base64,").count(), 28);
     assert!(!page.contains("http") && page.contains("the weights that ship"));
 
     // Its own pictures, read back as another program's: 8 bits apart.
