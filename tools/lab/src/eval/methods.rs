@@ -17,7 +17,7 @@ pub enum Method {
     Detail,
     /// The model with detail, fitted to the photographs ([`subsplat::finish::fit()`]).
     Fit,
-    /// What `subsplat run` gives: parents at the depth at which the photographs agree, optimised on the
+    /// Gaussians that `subsplat run` gives: parents at the depth at which the photographs agree, optimised on the
     /// photographs of the input's size; their children with detail, fitted and refined
     /// ([`subsplat::finish::refine()`]).
     Refine,

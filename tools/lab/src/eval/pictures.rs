@@ -76,7 +76,7 @@ enum Set {
 /// Sets of which each is made of the one before it.
 const IN_ORDER: [Set; 3] = [Set::Children, Set::Detailed, Set::Fitted];
 
-/// What happens to parents before they are divided.
+/// Preparation of parents before they are divided.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Parents {
     /// Depth is matched, and they are refined on the photographs of the input's size.
@@ -260,10 +260,7 @@ impl<'a> PictureMaker<'a> {
         let options = Refine::Auto.options_for(inputs.len(), own.len(), true);
         let options =
             options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
-        if let Some(mut options) = options {
-            if let Ok(v) = std::env::var("PS") {
-                options.steps = v.parse().unwrap_or(60);
-            }
+        if let Some(options) = options {
             refine_parents(&mut own, inputs, &small, &options, &mut renderer, &mut part)?;
         }
         encoding = encoding.with_parents(model, &own)?;
@@ -283,26 +280,12 @@ impl<'a> PictureMaker<'a> {
     /// The network's Gaussians, one a pixel, fitted to and refined on the photographs of the input's size.
     fn refined_parents(&self, network: &Network<'_>, crops: &Crops) -> Result<Splats> {
         let small = self.raster_options(network, 1.0, None);
-        let smaller = |c: &Cropped| Cropped {
-            target: c.input.clone(),
-            target_camera: c.input_camera,
-            ..c.clone()
-        };
-        let inputs: Vec<Cropped> = crops.inputs.iter().map(smaller).collect();
-        let mut children = SceneChildren::of_splats(network.splats(Set::Parents, 1)?);
-        let mut renderer = Renderer::default();
-        let renderer = &mut renderer;
-        let options = FitOptions::default();
-        let mut step = |_: usize| ControlFlow::Continue(());
-        fit_to_inputs(&mut children.splats, &inputs, &small, &options, renderer, &mut step)?;
-        let size = children.splats.len() / inputs.len().max(1);
-        children.groups.ranges = (0..inputs.len()).map(|v| v * size..(v + 1) * size).collect();
-        children.groups.equal_families = true;
-        let SceneChildren { splats, groups, .. } = &mut children;
-        let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
-        let mut step = |_: &PhaseRun<'_>| ControlFlow::Continue(());
-        refine_on_inputs(splats, groups, &inputs, &small, &options, renderer, &mut step)?;
-        Ok(children.splats)
+        let mut parents = network.splats(Set::Parents, 1)?;
+        let options = Refine::Auto.options_for(crops.inputs.len(), parents.len(), true);
+        let mut part = |_: f32| ControlFlow::Continue(());
+        let renderer = &mut Renderer::default();
+        refine_parents(&mut parents, &crops.inputs, &small, &options, renderer, &mut part)?;
+        Ok(parents)
     }
 
     /// The Gaussians of [`Set::Detailed`] at full density, as many as the density allows: those of
@@ -382,7 +365,8 @@ impl Network<'_> {
         SceneEncoding::new(self.views.clone(), self.output.clone(), self.parents.clone())
     }
 
-    /// The model's Gaussians of the primaries in `encoding`, without detail. `raster` renders pictures of the input's size.
+    /// The model's Gaussians of the primaries in `encoding`, without detail. `raster` renders pictures of
+    /// the input's size.
     fn children(
         &self,
         encoding: &SceneEncoding,
