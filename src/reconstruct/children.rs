@@ -3,15 +3,17 @@
 
 use super::density::{Density, counts, grids};
 use super::detail::{self, add_detail};
+use super::finishing::input_views;
 use super::{Error, Result};
-use crate::finish::{Groups, LEAST_SHARE, TargetView, hidden, shares};
+use crate::finish::{Groups, LEAST_SHARE, hidden, shares};
 use crate::network::model::scene_encoding::SceneEncoding;
 use crate::network::model::subsplat::{SceneOutput, SubSplat};
 use crate::network::model::trace::Checkpoint;
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
-use subsplat_kernels::layout::{CHILDREN_MAX, RasterOptions, gain_with_offsets};
+use subsplat_kernels::cpu::detail::with_residuals;
+use subsplat_kernels::layout::{CHILDREN_MAX, RasterOptions};
 
 /// Numbers of a gain with colour offsets: γ, then δ.
 const GAIN_WITH_OFFSETS: usize = 4;
@@ -75,8 +77,7 @@ pub fn counts_of(
     }
     let parents = encoding.parents(network)?;
     let grids = grids_of(network);
-    let photographs: Vec<TargetView<'_>> =
-        inputs.iter().map(|c| TargetView { camera: &c.input_camera, image: &c.input }).collect();
+    let photographs = input_views(inputs);
     let mut shares = shares(&parents, &photographs, raster, renderer);
     let upscale = grids.last().copied().unwrap_or(1);
     let mut limit = density.limit(parents.len(), inputs.len(), upscale);
@@ -140,21 +141,21 @@ impl SceneChildren {
     /// Adds the colour offsets of `parents` to those of their children. Parents without offsets change
     /// nothing.
     pub fn add_offsets(&mut self, parents: &Splats) {
-        if parents.gain_channels() != GAIN_WITH_OFFSETS || self.splats.is_empty() {
+        let (offsets, rest) = parents.gain.as_chunks::<GAIN_WITH_OFFSETS>();
+        if offsets.len() != parents.len() || !rest.is_empty() || self.splats.is_empty() {
             return;
         }
-        let count = self.splats.len();
-        let children = (count / parents.len().max(1)).max(1);
-        let mut gain = gain_with_offsets(&self.splats.gain, count);
-        for (i, gain) in gain.chunks_exact_mut(GAIN_WITH_OFFSETS).enumerate() {
+        let children = (self.splats.len() / parents.len().max(1)).max(1);
+        let of_child = |i: usize| {
             let parent = match &self.origins {
                 Origins::Regular => i / children,
                 Origins::Mixed { parents, .. } => parents[i] as usize,
             };
-            let of = &parents.gain[parent * GAIN_WITH_OFFSETS..][..GAIN_WITH_OFFSETS];
-            gain[1..].iter_mut().zip(&of[1..]).for_each(|(own, of)| *own += of);
-        }
-        self.splats.gain = gain;
+            let [_, r, g, b] = offsets[parent];
+            [r, g, b]
+        };
+        let offsets: Vec<f32> = (0..self.splats.len()).flat_map(of_child).collect();
+        self.splats.gain = with_residuals(&self.splats.gain, &offsets);
     }
 
     /// Adds the photographs' detail to the colours. Returns whether any photograph has detail.

@@ -19,7 +19,7 @@
 use super::{Error, Result, finishing};
 use crate::cameras::dense::{DenseMatch, DenseView, match_depth};
 use crate::cameras::matches::GrayImage;
-use crate::finish::{FitOptions, PhaseRun, RefineOptions, TargetView, fit, refine};
+use crate::finish::{FitOptions, PhaseRun, RefineOptions, fit, refine};
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::reconstruct::inputs::pair::choose_sources;
 use crate::scene::render::Renderer;
@@ -123,8 +123,7 @@ pub fn refine_parents(
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(f32) -> ControlFlow<()>,
 ) -> Result<()> {
-    let views: Vec<TargetView<'_>> =
-        inputs.iter().map(|c| TargetView { camera: &c.input_camera, image: &c.input }).collect();
+    let views = finishing::input_views(inputs);
     let mut step = |_: usize| progress(0.0);
     let sizes = FitOptions::default();
     fit(parents, &views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;

@@ -66,6 +66,11 @@ pub(crate) fn check_refine(refine: Refine) -> Result<()> {
     check_time(refine.time(), HAS_CLOCK).map_err(error)
 }
 
+/// The photographs of the input's size.
+pub(super) fn input_views(inputs: &[Cropped]) -> Vec<TargetView<'_>> {
+    inputs.iter().map(|c| TargetView { camera: &c.input_camera, image: &c.input }).collect()
+}
+
 fn views_of(inputs: &[Cropped]) -> Vec<TargetView<'_>> {
     let view = |c| {
         let (camera, image) = sharp_picture(c);
