@@ -72,14 +72,14 @@ pub fn counts_of(
     raster: &RasterOptions,
     renderer: &mut Renderer,
 ) -> Result<Option<Counts>> {
-    if density.is_full(inputs.len()) {
+    let grids = grids_of(network);
+    let upscale = grids.last().copied().unwrap_or(1);
+    if density.is_full(encoding.per_view() * inputs.len(), inputs.len(), upscale) {
         return Ok(None);
     }
     let parents = encoding.parents(network)?;
-    let grids = grids_of(network);
     let photographs = input_views(inputs);
     let mut shares = shares(&parents, &photographs, raster, renderer);
-    let upscale = grids.last().copied().unwrap_or(1);
     let mut limit = density.limit(parents.len(), inputs.len(), upscale);
     let hidden = hidden(&shares, inputs.len(), LEAST_SHARE);
     for (share, _) in shares.iter_mut().zip(&hidden).filter(|(_, hidden)| **hidden) {

@@ -1,6 +1,7 @@
 //! Fit and refinement of a reconstructed scene on its photographs.
 
 use super::{Error, Refine, Result};
+use crate::files::photos::resize::{Filter, resize};
 use crate::finish::{
     FinishError, FitOptions, FitReport, Groups, PhaseRun, RefineOptions, RefineReport, TargetView,
     check_time, fit, refine_groups,
@@ -9,18 +10,40 @@ use crate::reconstruct::inputs::crop::Cropped;
 use crate::scene::pictures::Rgb;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
+use std::borrow::Cow;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::clock::HAS_CLOCK;
 use subsplat_kernels::layout::RasterOptions;
 
-/// The largest picture of `c` that is no enlargement of the photograph, with its camera: the
-/// target's size, else the input's.
-fn sharp_picture(c: &Cropped) -> (&Camera, &Rgb) {
-    if c.window.scale.min_element() < 1.0 {
-        (&c.input_camera, &c.input)
-    } else {
-        (&c.target_camera, &c.target)
+/// A photograph at the size at which Gaussians are compared with it.
+struct SharpPicture<'a> {
+    camera: Camera,
+    image: Cow<'a, Rgb>,
+}
+
+impl<'a> SharpPicture<'a> {
+    /// The largest picture of `c` that is no enlargement of the photograph: of the target's size, of the
+    /// photograph's own, or of the input's where the photograph is smaller.
+    fn new(c: &'a Cropped) -> Self {
+        let scale = c.window.scale.min_element();
+        if !(scale < 1.0) {
+            return Self { camera: c.target_camera, image: Cow::Borrowed(&c.target) };
+        }
+        let side = |side: usize| (side as f32 * scale).round() as usize;
+        let (width, height) = (side(c.target.width), side(c.target.height));
+        let camera = c.target_camera.intrinsics().resized(width, height);
+        match c.target_camera.with_intrinsics(camera) {
+            Ok(camera) if width > c.input.width && height > c.input.height => {
+                let image = resize(&c.target, width, height, Filter::Lanczos);
+                Self { camera, image: Cow::Owned(image) }
+            }
+            _ => Self { camera: c.input_camera, image: Cow::Borrowed(&c.input) },
+        }
+    }
+
+    fn view(&self) -> TargetView<'_> {
+        TargetView { camera: &self.camera, image: &self.image }
     }
 }
 
@@ -37,7 +60,8 @@ pub fn fit_to_inputs(
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
 ) -> Result<FitReport> {
-    fit(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
+    let pictures = sharp_pictures(inputs);
+    fit(splats, &views_of(&pictures), raster, options, renderer, progress).map_err(error)
 }
 
 /// Refines the Gaussians of `inputs`, those of each photograph in `groups`, on their photographs.
@@ -54,8 +78,9 @@ pub fn refine_on_inputs(
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport> {
-    refine_groups(splats, groups, &views_of(inputs), raster, options, renderer, progress)
-        .map_err(error)
+    let pictures = sharp_pictures(inputs);
+    let views = views_of(&pictures);
+    refine_groups(splats, groups, &views, raster, options, renderer, progress).map_err(error)
 }
 
 /// Refuses a refinement that this platform cannot end.
@@ -71,12 +96,12 @@ pub(super) fn input_views(inputs: &[Cropped]) -> Vec<TargetView<'_>> {
     inputs.iter().map(|c| TargetView { camera: &c.input_camera, image: &c.input }).collect()
 }
 
-fn views_of(inputs: &[Cropped]) -> Vec<TargetView<'_>> {
-    let view = |c| {
-        let (camera, image) = sharp_picture(c);
-        TargetView { camera, image }
-    };
-    inputs.iter().map(view).collect()
+fn sharp_pictures(inputs: &[Cropped]) -> Vec<SharpPicture<'_>> {
+    inputs.iter().map(SharpPicture::new).collect()
+}
+
+fn views_of<'a>(pictures: &'a [SharpPicture<'_>]) -> Vec<TargetView<'a>> {
+    pictures.iter().map(SharpPicture::view).collect()
 }
 
 /// The error of a run for one of the optimisation.

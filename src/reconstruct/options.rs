@@ -170,21 +170,21 @@ impl Options {
         self.input_size.limited_to(shapes, upscale).resolve(shapes, stride)
     }
 
-    /// Options of the refinement on which that of `parents` primaries depends.
-    pub(super) fn parents_options(&self, photographs: usize, parents: usize) -> RefineOptions {
+    /// Options of the refinement on which that of the primaries depends.
+    pub(super) fn parents_options(&self, photographs: usize) -> RefineOptions {
         let refine = self.parents.unwrap_or(self.refine);
-        refine.options_for(photographs, parents, self.fit.steps > 0)
+        refine.options_for(photographs, self.fit.steps > 0)
     }
 
     /// Returns whether depth is matched: not where the Gaussians are to stay the network's.
     pub(super) fn matches_depth(&self) -> bool {
-        let stays = self.fit.steps == 0 && self.refine_options(2, 0).steps == 0;
+        let stays = self.fit.steps == 0 && self.refine_options(2).steps == 0;
         self.matching == Matching::Photographs && !stays
     }
 
-    /// Options of the refinement for a number of photographs and of Gaussians.
-    pub(super) fn refine_options(&self, photographs: usize, gaussians: usize) -> RefineOptions {
-        self.refine.options_for(photographs, gaussians, self.fit.steps > 0)
+    /// Options of the refinement for a number of photographs.
+    pub(super) fn refine_options(&self, photographs: usize) -> RefineOptions {
+        self.refine.options_for(photographs, self.fit.steps > 0)
     }
 
     /// The depth range before any photograph is read: [`Options::depth_range`], then
@@ -208,9 +208,9 @@ impl Options {
 /// | level | input | Gaussians, at most | steps of the refinement, a photograph |
 /// |---|---|---|---|
 /// | `Fast` | 192² | 150,000 | 4 |
-/// | `Normal` | 256² | [`Density::Auto`] | 8, of at most 1.5 million Gaussians |
-/// | `High` | up to 512² | 1.5 million | 8 |
-/// | `Best` | up to 512² | 1.5 million | 16 |
+/// | `Normal` | 256² | [`Density::Auto`] | 8 |
+/// | `High` | up to 512² | [`Density::Auto`] | 8 |
+/// | `Best` | up to 512² | [`Density::Auto`] | 16 |
 ///
 /// PSNR in dB / SSIM of new views, PSNR at the inputs' own cameras, CPU-seconds and memory, one run each
 /// on a busy EPYC with AVX-512. The first two pairs chose the table; the last two columns did not. A
@@ -275,15 +275,9 @@ impl Quality {
                 ..normal
             },
             Self::Normal => normal,
-            // As many as `Refine::Auto` refines. All of them score lower, refined or not: see `Quality`.
-            Self::High => QualitySettings {
-                input_size: InputSize::AtMost(512 * 512),
-                density: Density::Count(AUTO_GAUSSIANS_MAX),
-                ..normal
-            },
+            Self::High => QualitySettings { input_size: InputSize::AtMost(512 * 512), ..normal },
             Self::Best => QualitySettings {
                 input_size: InputSize::AtMost(512 * 512),
-                density: Density::Count(AUTO_GAUSSIANS_MAX),
                 refine: Refine::Each(16),
                 ..normal
             },
@@ -302,15 +296,28 @@ pub enum TargetSize {
     Times(f32),
     /// These sides, px. The input has their shape where [`Options::input_size`] leaves it open.
     Exact(Size),
+    /// The largest pictures of the input's shape that enlarge no photograph, of four megapixels at
+    /// most; [`TargetSize::Upscaled`] where that is larger.
+    Photographs,
 }
 
+/// Most pixels of [`TargetSize::Photographs`].
+const PHOTOGRAPHS_AREA: f64 = 4e6;
+
 impl TargetSize {
-    /// The size for an input of `input_size` and a model of `upscale`. A factor that is not finite
-    /// gives 0 or a side that is too large, which
+    /// The size for an input of `input_size`, a model of `upscale`, and photographs of the sizes
+    /// `photos`, px. A factor that is not finite gives 0 or a side that is too large, which
     /// [`Reconstructor::run`](super::Reconstructor::run) refuses.
-    pub fn resolve(self, input_size: Size, upscale: usize) -> Size {
+    pub fn resolve(self, input_size: Size, upscale: usize, photos: &[Size]) -> Size {
         let Size { width, height } = input_size;
         match self {
+            Self::Photographs => {
+                let (w, h) = (width.max(1) as f64, height.max(1) as f64);
+                let covers = |p: &Size| (p.width as f64 / w).min(p.height as f64 / h);
+                let most = (PHOTOGRAPHS_AREA / (w * h)).sqrt();
+                let factor = photos.iter().map(covers).fold(most, f64::min).max(upscale as f64);
+                Size::new((factor * w) as usize, (factor * h) as usize)
+            }
             Self::Upscaled => {
                 Size::new(width.saturating_mul(upscale), height.saturating_mul(upscale))
             }
@@ -327,8 +334,8 @@ impl TargetSize {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refine {
-    /// Eight steps a photograph, 64 at most; none where [`Options::fit`] is off, and none of more
-    /// than 1.5 million Gaussians, for which a refinement takes more memory than the network.
+    /// Eight steps a photograph, 64 at most; none where [`Options::fit`] is off. A refinement of two
+    /// photographs takes 322 bytes a Gaussian.
     #[default]
     Auto,
     /// None.
@@ -349,16 +356,11 @@ const AUTO_STEPS: usize = 8;
 /// Photographs whose steps [`Refine::Auto`] and [`Refine::Each`] allow in all.
 const PHOTOGRAPHS_MAX: usize = 8;
 
-/// Most Gaussians that [`Refine::Auto`] refines. The buffers of a refinement of two
-/// photographs take 322 bytes a Gaussian.
-const AUTO_GAUSSIANS_MAX: usize = 3 << 19;
-
 impl Refine {
-    /// Options for a number of photographs and of Gaussians, which are `fitted` or not.
-    pub fn options_for(self, photographs: usize, gaussians: usize, fitted: bool) -> RefineOptions {
+    /// Options for a number of photographs, whose Gaussians are `fitted` or not.
+    pub fn options_for(self, photographs: usize, fitted: bool) -> RefineOptions {
         match self {
-            Self::Auto if !fitted || gaussians > AUTO_GAUSSIANS_MAX => Self::Off,
-            Self::Each(_) if !fitted => Self::Off,
+            Self::Auto | Self::Each(_) if !fitted => Self::Off,
             refine => refine,
         }
         .options(photographs)
@@ -480,21 +482,27 @@ mod tests {
     }
 
     #[test]
-    fn steps_of_a_refinement() {
-        let steps = |refine: Refine, photographs, gaussians, fitted| {
-            refine.options_for(photographs, gaussians, fitted).steps
+    fn pictures_of_the_photographs_size() {
+        let size = |photos: &[(usize, usize)]| {
+            let photos: Vec<Size> = photos.iter().map(|(w, h)| Size::new(*w, *h)).collect();
+            let size = TargetSize::Photographs.resolve(Size::new(288, 224), 2, &photos);
+            (size.width, size.height)
         };
-        assert_eq!([2, 5, 8, 20].map(|n| steps(Refine::Auto, n, 9, true)), [16, 40, 64, 64]);
-        assert_eq!([2, 8, 20].map(|n| steps(Refine::Each(4), n, 9, true)), [8, 32, 32]);
-        let many = AUTO_GAUSSIANS_MAX + 1;
-        assert_eq!((steps(Refine::Auto, 2, many, true), steps(Refine::Auto, 2, 9, false)), (0, 0));
-        assert_eq!(
-            (steps(Refine::Each(4), 2, many, true), steps(Refine::Each(4), 2, 9, false)),
-            (8, 0)
-        );
-        assert_eq!(
-            (steps(Refine::Steps(3), 2, many, false), steps(Refine::Off, 2, 9, true)),
-            (3, 0)
-        );
+        // Two megapixels of another shape; a smaller second photograph; twelve megapixels; small ones.
+        assert_eq!(size(&[(1920, 1080); 2]), (1388, 1080));
+        assert_eq!(size(&[(4032, 3024), (1152, 896)]), (1152, 896));
+        let (w, h) = size(&[(4032, 3024); 2]);
+        assert!((3_980_000..=4_000_000).contains(&(w * h)), "{w}x{h}");
+        assert_eq!(size(&[(400, 300); 2]), (576, 448));
+    }
+
+    #[test]
+    fn steps_of_a_refinement() {
+        let steps =
+            |refine: Refine, photographs, fitted| refine.options_for(photographs, fitted).steps;
+        assert_eq!([2, 5, 8, 20].map(|n| steps(Refine::Auto, n, true)), [16, 40, 64, 64]);
+        assert_eq!([2, 8, 20].map(|n| steps(Refine::Each(4), n, true)), [8, 32, 32]);
+        assert_eq!([Refine::Auto, Refine::Each(4)].map(|r| steps(r, 2, false)), [0, 0]);
+        assert_eq!((steps(Refine::Steps(3), 2, false), steps(Refine::Off, 2, true)), (3, 0));
     }
 }

@@ -106,9 +106,7 @@ impl Prepared<'_> {
         let raster_at = |ratio: f32| config.raster_options(ratio, bounds.near, colour);
         let mut renderer = Renderer::new(model.backend());
         let density = options.density;
-        // More children than `Refine::Auto` allows are not refined, but their parents are.
-        let count = encoding.per_view() * inputs.len();
-        let scene_options = options.parents_options(inputs.len(), count);
+        let scene_options = options.parents_options(inputs.len());
         let parents_options = options_of_parents(&scene_options, &inputs);
         let mut factors = Vec::new();
         let mut parents = None;
@@ -154,7 +152,7 @@ impl Prepared<'_> {
         let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
         let fit_options = &options.fit;
-        let mut refine_options = options.refine_options(inputs.len(), splats.len());
+        let mut refine_options = options.refine_options(inputs.len());
         if let (Some(time), Some(used)) =
             (refine_options.time, parents_options.and_then(|options| options.time))
         {

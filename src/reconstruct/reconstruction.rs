@@ -84,7 +84,7 @@ impl Reconstruction {
         progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
     ) -> Result<RefineReport> {
         let Self { splats, groups, inputs, raster_options, fit, .. } = self;
-        let options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
+        let options = refine.options_for(inputs.len(), fit.is_some());
         let report =
             refine_on_inputs(splats, groups, inputs, raster_options, &options, renderer, progress)?;
         self.refinement = Some(report);

@@ -188,7 +188,7 @@ impl Reconstructor {
         let stride = self.config().stride();
         let upscale = self.config().upscale;
         let input_size = options.input_size_for(&sizes, stride, upscale);
-        let target_size = options.target_size.resolve(input_size, upscale);
+        let target_size = options.target_size.resolve(input_size, upscale, &sizes);
         let crop = CropOptions { target_size, ..self.crop_options(input_size) };
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
         let (mut adjusted, mut adjustment) = (Vec::new(), None);
@@ -311,12 +311,12 @@ impl Reconstructor {
         let refinement = match options.refine {
             // The number of steps in a second is not known.
             Refine::Seconds(seconds) => 10.0 * seconds as f32,
-            _ => options.refine_options(photos, gaussians).steps as f32,
+            _ => options.refine_options(photos).steps as f32,
         };
         let matches = options.matches_depth();
         let refinement_of_parents = match options.parents.unwrap_or(options.refine) {
             Refine::Seconds(seconds) => 2.0 * seconds as f32,
-            _ => 2.0 * options.parents_options(photos, parents).steps as f32,
+            _ => 2.0 * options.parents_options(photos).steps as f32,
         };
         let costs = [
             (Stage::Poses, if options.poses == Poses::Adjusted { 0.3 * n } else { 0.0 }),

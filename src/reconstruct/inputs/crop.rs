@@ -9,24 +9,26 @@
 //!
 //! Intrinsics follow every step (fx by the resampled width over the photograph's, fy by
 //! the height: the rounding makes them differ slightly). [`CropRule`] says what becomes
-//! of the principal point.
+//! of the principal point, and of a dark frame (`frame.rs`).
 
+use super::frame;
 use crate::files::photos::resize::{Filter, Window, resize, resize_window};
 use crate::files::{Error, Result};
 use crate::scene::pictures::Rgb;
 use glam::Vec2;
 use subsplat_kernels::camera::{Camera, CameraError, Intrinsics, Size};
 
-/// Rule for the principal point of a crop.
+/// Rule for the principal point of a crop, and for a photograph's dark frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum CropRule {
-    /// It moves with the pixels: exact for any camera.
+    /// It moves with the pixels: exact for any camera. A dark frame, a few black pixels along the sides
+    /// that a correction of lens distortion leaves, is filled with the pixels inside it.
     #[default]
     Exact,
     /// Its fraction of the width and height stays, as MVSplat's shim has it: what the
     /// public weights were trained and measured with. For a centred principal point it
     /// differs from `Exact` by the half pixel that an odd offset is rounded down by;
-    /// for others it is wrong.
+    /// for others it is wrong. A dark frame stays.
     Mvsplat,
 }
 
@@ -208,6 +210,8 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
         let expected = format!("target sides of 1 to {SIDE_MAX} pixels (the input is {w}x{h})");
         return bad(expected, format!("{target_w}x{target_h}"));
     }
+    let filled = (options.rule == CropRule::Exact).then(|| frame::filled(photo)).flatten();
+    let photo = filled.as_ref().unwrap_or(photo);
     let input_size = (w - w % stride, h - h % stride);
     let size = (photo.width, photo.height);
     // The target loses the same share as the input. At whole upscales the window lies in whole

@@ -2,4 +2,5 @@
 
 pub mod crop;
 pub mod exposure;
+mod frame;
 pub mod pair;

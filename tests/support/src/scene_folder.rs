@@ -60,6 +60,7 @@ fn example() -> &'static Example {
                 scattered: 0.0,
                 wide: 0.0,
                 samples: 1,
+                fine_textures: false,
             },
         )
     })

@@ -270,7 +270,9 @@ const SPZ_COUNT_MAX: u64 = 10_000_000;
 /// Largest .glb: its header counts bytes with 32 bits.
 const GLB_BYTES_MAX: u64 = u32::MAX as u64;
 /// Size of a scene file that is announced before the work, bytes.
-const ANNOUNCED: u64 = 200_000_000;
+const ANNOUNCED: u64 = 90_000_000;
+/// Largest .ply with SH of degree 3 by default; a larger one has the scene's own degree.
+const PLY_PADDED_MAX: u64 = 150_000_000;
 
 /// Largest size of a scene file of `count` Gaussians with SH of `stored` degrees, of which `asked`
 /// are written, bytes; .spz and .html are compressed, .html contains base64.
@@ -292,10 +294,32 @@ fn bytes_at_most(format: SceneFormatArg, count: u64, stored: usize, asked: Optio
 /// large files. The scene has at most `count` Gaussians with SH of `degree`.
 pub fn check_formats(args: &RunArgs, count: u64, degree: usize) -> Result<()> {
     for format in &args.save {
-        let bytes = bytes_at_most(*format, count, degree, args.content.sh);
+        let written = sh_degree(args, count, degree);
+        let bytes = bytes_at_most(*format, count, degree, written);
         check_format(*format, count, bytes, args.content.min_opacity)?;
+        if *format == SceneFormatArg::Ply && bytes > ANNOUNCED {
+            let [ply, spz] = [bytes, bytes_at_most(SceneFormatArg::Spz, count, degree, written)]
+                .map(|bytes| bytes / 1_000_000);
+            let padded = match written {
+                Some(degree) if args.content.sh.is_none() => format!(
+                    "; its colours have degree {degree} (--sh 3 adds zeros that some viewers expect)"
+                ),
+                _ => String::new(),
+            };
+            print_line(format!(
+                "scene.ply takes up to {ply} MB for {count} splats, and --save spz up to {spz} MB{padded}"
+            ));
+        }
     }
     Ok(())
+}
+
+/// Degree of the SH that the files of a scene of `count` Gaussians with SH of `degree` have; `None` leaves
+/// it to the format.
+pub fn sh_degree(args: &RunArgs, count: u64, degree: usize) -> Option<usize> {
+    let padded = bytes_at_most(SceneFormatArg::Ply, count, degree, None);
+    let own = (padded > PLY_PADDED_MAX).then_some(degree.min(3));
+    args.content.sh.or(own)
 }
 
 /// [`check_formats`] of one file. A least opacity may leave fewer Gaussians, so that nothing is
@@ -318,7 +342,7 @@ fn check_format(format: SceneFormatArg, count: u64, bytes: u64, min_opacity: f32
             bytes as f64 / 1e9
         );
     }
-    if bytes > ANNOUNCED {
+    if bytes > ANNOUNCED && format != SceneFormatArg::Ply {
         let size = bytes as f64 / 1e6;
         print_line(format!("{name} takes up to {size:.0} MB for {count} splats"));
     }

@@ -64,13 +64,9 @@ pub fn input_size(
     scene: &Scene,
     context: &[usize],
 ) -> Result<(InputSize, (usize, usize))> {
-    let size = |&i: &usize| {
-        let k = scene.frames[i].camera.intrinsics();
-        Size::new(k.width, k.height)
-    };
-    let photos: Vec<Size> = match target {
+    let photos = match target {
         TargetSize::Exact(size) => vec![size],
-        _ => context.iter().map(size).collect(),
+        _ => photo_sizes(scene, context),
     };
     let config = model.config();
     let (views, density) = (context.len(), args.density());
@@ -95,6 +91,15 @@ pub fn input_size(
         asked.1
     );
     Ok((chosen, (w, h)))
+}
+
+/// Sizes of the photographs of frames `context`, px.
+pub fn photo_sizes(scene: &Scene, context: &[usize]) -> Vec<Size> {
+    let size = |&i: &usize| {
+        let k = scene.frames[i].camera.intrinsics();
+        Size::new(k.width, k.height)
+    };
+    context.iter().map(size).collect()
 }
 
 /// Returns the model with as many children as pictures of size `target` need, for an input of

@@ -22,7 +22,9 @@ use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{comment_of_camera, comment_of_options};
 use subsplat::scene::score::{GaussianReport, InputReport, Score};
 use subsplat::scene::splats::{SplatStatistics, Splats};
-use subsplat::{Detail, Options, Photo, Reconstruction, Reconstructor, Warning};
+use subsplat::{
+    Detail, InputSize, Options, Photo, Reconstruction, Reconstructor, TargetSize, Warning,
+};
 use subsplat_kernels::camera::{Camera, NearFar, Size};
 use subsplat_kernels::layout::{Convention, RasterOptions};
 
@@ -50,11 +52,23 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let source = &args.source;
     let target = args.target_size();
     let context = &plan.context;
-    let (size, (w, h)) = reconstruct::input_size(source, target, &model, &plan.scene, context)?;
+    let (mut size, (w, h)) = reconstruct::input_size(source, target, &model, &plan.scene, context)?;
+    let target = match target {
+        // The number of children follows from the size of the pictures, not the other way round.
+        TargetSize::Photographs => {
+            size = InputSize::exact(w, h);
+            let photos = reconstruct::photo_sizes(&plan.scene, context);
+            TargetSize::Exact(target.resolve(Size::new(w, h), model.config().upscale, &photos))
+        }
+        target => target,
+    };
     let model = reconstruct::with_children(source, target, model, context.len(), (w, h))?;
     (plan.options.input_size, plan.options.target_size) = (size, target);
-    let Size { width, height } = target.resolve(Size::new(w, h), model.config().upscale);
+    let Size { width, height } = target.resolve(Size::new(w, h), model.config().upscale, &[]);
     let target_size = (width, height);
+    if args.target_size() == TargetSize::Photographs {
+        print_line(format!("pictures of {width}x{height} pixels, the size of the photographs"));
+    }
     let targets = targets(args, &plan, target_size)?;
     memory::check_picture("the picture size", target_size)?;
     let inputs = plan.context.len();
@@ -82,7 +96,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
         let comments = std::iter::once(comment_of_options(&options)).chain(camera).collect();
         let save = SaveOptions {
-            sh_degree: args.content.sh,
+            sh_degree: output::sh_degree(args, count, degree),
             min_opacity: args.content.min_opacity,
             comments,
             ..SaveOptions::default()

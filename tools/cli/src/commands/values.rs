@@ -1,6 +1,6 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
-use super::args::InputSizeArg;
+use super::args::{InputSizeArg, PictureSizeArg};
 use subsplat::{Density, Refine};
 use subsplat_kernels::camera::Intrinsics;
 use subsplat_kernels::layout::CHILDREN_MAX;
@@ -175,6 +175,17 @@ pub fn size(text: &str) -> Result<(usize, usize), String> {
     };
     let most = Intrinsics::SIDE_MAX;
     sides.map_err(|_| format!("expected N or WxH, 1 to {most} pixels a side"))
+}
+
+/// Parses [`size`], or `photo`.
+pub fn picture_size(text: &str) -> Result<PictureSizeArg, String> {
+    match text {
+        "photo" => Ok(PictureSizeArg::Photo),
+        _ => match size(text) {
+            Ok((width, height)) => Ok(PictureSizeArg::Sides(width, height)),
+            Err(expected) => Err(format!("{expected}, or `photo`")),
+        },
+    }
 }
 
 /// The conflict of a near and a far end, if there is one.

@@ -9,9 +9,10 @@ use subsplat_cli::commands::values;
 
 const NOTES: &str = "\
 Methods: subsplat (the model), detail (the model with detail from the photographs), fit (the same, \
-fitted to the photographs), refine (the same, refined on them: what `run` gives, so that more than \
-1.5 million Gaussians are not refined), pair (detail, on the two inputs nearest to the target \
-alone), backbone (its backbone's Gaussians alone, rendered at the target's size: spgr=off), lowpass \
+fitted to the photographs), refine (what `run` gives: depth matched, parents refined at the input's \
+size, then their children), unmatched (refine without the match), direct (fit, refined: without both), \
+enlarged and half (what `run` gives for pictures of the input's size, and of half the target's sides, \
+enlarged by Lanczos), pair (detail, on the two inputs nearest to the target alone), backbone (its backbone's Gaussians alone, rendered at the target's size: spgr=off), lowpass \
 (the same, low-pass scaled to the input), bilinear (the same rendered at the input's size and \
 enlarged), uniform (K equal Gaussians a pixel, untrained), copy (the input nearest to the target), \
 mean (of the inputs).

@@ -48,13 +48,20 @@ impl Options {
     /// from the others at this `upscale`.
     pub fn new(upscale: f32) -> Self {
         use Method::{
-            Backbone, Bilinear, Copy, Enlarged, Fit, Lowpass, Mean, Refine, Subsplat, Uniform,
+            Backbone, Bilinear, Copy, Enlarged, Fit, Half, Lowpass, Mean, Refine, Subsplat, Uniform,
         };
-        let methods = if upscale > 1.0 {
-            vec![Subsplat, Fit, Refine, Enlarged, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean]
+        let enlarged: &[Method] = match upscale {
+            _ if upscale > 2.0 => &[Half, Enlarged],
+            _ if upscale > 1.0 => &[Enlarged],
+            _ => &[],
+        };
+        let model: &[Method] = &[Subsplat, Fit, Refine];
+        let rest: &[Method] = if upscale > 1.0 {
+            &[Backbone, Lowpass, Bilinear, Uniform, Copy, Mean]
         } else {
-            vec![Subsplat, Fit, Refine, Backbone, Copy, Mean]
+            &[Backbone, Copy, Mean]
         };
+        let methods = [model, enlarged, rest].concat();
         Self {
             upscale,
             input_size: None,
@@ -276,7 +283,7 @@ impl Evaluator {
         let least = (least(|p| p.image().width), least(|p| p.image().height));
         let (width, height) = fitting(nominal, upscale, stride, least);
         let input_size = Size { width, height };
-        let target_size = TargetSize::Times(upscale).resolve(input_size, 1);
+        let target_size = TargetSize::Times(upscale).resolve(input_size, 1, &[]);
         let options =
             CropOptions { rule, lr_from, target_size, ..CropOptions::new(input_size, 1, stride) };
         let cropped =

@@ -38,9 +38,11 @@ pub enum Method {
     Lowpass,
     /// The backbone's Gaussians rendered at the input's size, then enlarged bilinearly.
     Bilinear,
-    /// The backbone's Gaussians, fitted to and refined on the photographs of the input's size, rendered at
-    /// that size, then enlarged by Lanczos: the strongest picture without children.
+    /// The picture of [`Method::Refine`] for a target of the input's size, enlarged by Lanczos: the
+    /// strongest picture without children.
     Enlarged,
+    /// The picture of [`Method::Refine`] for a target of half the sides, enlarged by Lanczos.
+    Half,
     /// K = r² equal children of each of the backbone's Gaussians, evenly over its pixel:
     /// SubSplat's split with untrained heads. The paper's Table D trains a backbone with K
     /// Gaussians a pixel instead (`gaussians_per_pixel` of its configuration); score its weights
@@ -60,7 +62,7 @@ pub enum Method {
 }
 
 /// Names of the methods that need no files, in the order of the tables.
-pub(crate) const NAMED: [(&str, Method); 16] = [
+pub(crate) const NAMED: [(&str, Method); 17] = [
     ("subsplat", Method::Subsplat),
     ("detail", Method::Detail),
     ("fit", Method::Fit),
@@ -74,6 +76,7 @@ pub(crate) const NAMED: [(&str, Method); 16] = [
     ("lowpass", Method::Lowpass),
     ("bilinear", Method::Bilinear),
     ("enlarged", Method::Enlarged),
+    ("half", Method::Half),
     ("uniform", Method::Uniform),
     ("copy", Method::Copy),
     ("mean", Method::Mean),

@@ -3,15 +3,16 @@
 use super::Method;
 use super::evaluator::{Crops, Options};
 use super::methods::{enlarged, mean, nearest};
+use glam::Vec2;
 use std::ops::ControlFlow;
 use subsplat::files::photos::resize::{Filter, resize};
 use subsplat::finish::{FitOptions, PhaseRun};
 use subsplat::network::config::LowpassRef;
 use subsplat::network::model::scene_encoding::SceneEncoding;
-use subsplat::network::model::subsplat::feature_channels;
+use subsplat::network::model::subsplat::{SubSplat, feature_channels};
 use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;
-use subsplat::reconstruct::inputs::crop::Cropped;
+use subsplat::reconstruct::inputs::crop::{Cropped, PhotoWindow};
 use subsplat::reconstruct::stages::{
     SceneChildren, add_detail, counts_of, fit_to_inputs, match_parents, options_of_parents,
     refine_on_inputs, refine_parents,
@@ -63,8 +64,8 @@ enum Set {
     Fitted,
     /// Refined children of parents that were prepared before.
     Refined(Parents),
-    /// Parents, refined on the photographs of the input's size.
-    RefinedParents,
+    /// What `run` gives at a smaller size.
+    Smaller(Smaller),
     /// The children of two inputs alone, with detail.
     Pair([usize; 2]),
     Opaque,
@@ -87,6 +88,55 @@ enum Parents {
     Predicted,
 }
 
+/// Size of the pictures of a baseline that are then enlarged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Smaller {
+    /// That of the network's input.
+    Input,
+    /// Half of the target's sides.
+    Half,
+}
+
+impl Smaller {
+    /// Of the methods that have one.
+    fn of(method: &Method) -> Option<Self> {
+        match method {
+            Method::Enlarged => Some(Self::Input),
+            Method::Half => Some(Self::Half),
+            _ => None,
+        }
+    }
+
+    /// Side over the input's, at targets of `upscale` times its side.
+    fn ratio(self, upscale: f32) -> f32 {
+        match self {
+            Self::Input => 1.0,
+            Self::Half => (upscale / 2.0).max(1.0),
+        }
+    }
+}
+
+/// `c` with a target of `ratio` times the input's sides.
+fn reduced(c: &Cropped, ratio: f32) -> Result<Cropped> {
+    if ratio == 1.0 {
+        let scale = Vec2::new(
+            c.target.width as f32 / c.input.width as f32,
+            c.target.height as f32 / c.input.height as f32,
+        );
+        let window = PhotoWindow { scale: c.window.scale * scale, ..c.window };
+        let (target, target_camera) = (c.input.clone(), c.input_camera);
+        return Ok(Cropped { target, target_camera, window, ..c.clone() });
+    }
+    let side = |side: usize| (side as f32 * ratio).round() as usize;
+    let (w, h) = (side(c.input.width), side(c.input.height));
+    let k = c.target_camera.intrinsics().resized(w, h);
+    let target_camera = c.target_camera.with_intrinsics(k)?;
+    let target = resize(&c.target, w, h, Filter::Lanczos);
+    let scale = Vec2::new(c.target.width as f32 / w as f32, c.target.height as f32 / h as f32);
+    let window = PhotoWindow { scale: c.window.scale * scale, ..c.window };
+    Ok(Cropped { target, target_camera, window, ..c.clone() })
+}
+
 impl Set {
     /// The set of `method` for a picture seen by `camera`.
     fn of(method: &Method, inputs: &[Cropped], camera: &Camera) -> Option<Self> {
@@ -97,7 +147,7 @@ impl Set {
             Method::Refine => Some(Self::Refined(Parents::Matched)),
             Method::Unmatched => Some(Self::Refined(Parents::Refined)),
             Method::Direct => Some(Self::Refined(Parents::Predicted)),
-            Method::Enlarged => Some(Self::RefinedParents),
+            Method::Enlarged | Method::Half => Smaller::of(method).map(Self::Smaller),
             Method::Pair => nearest_two(inputs, camera).map(Self::Pair),
             Method::Opaque => Some(Self::Opaque),
             Method::Random => Some(Self::Random),
@@ -181,16 +231,24 @@ impl<'a> PictureMaker<'a> {
         let splats = match (from, to, self.splats.take()) {
             (Some(from), Some(to), Some(splats)) if from < to => {
                 before = self.set_seconds;
-                self.refined(network, splats, crops, &IN_ORDER[from + 1..=to])?
+                let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
+                self.refined(network, splats, at, &IN_ORDER[from + 1..=to])?
             }
             (_, Some(to), _) => {
                 let raster = self.raster_options(network, 1.0, None);
                 let encoding = network.encoding();
-                let children = network.children(&encoding, &crops.inputs, self.density, &raster)?;
-                self.refined(network, children, crops, &IN_ORDER[1..=to])?
+                let model = network.model.model();
+                let inputs = &crops.inputs;
+                let children = network.children(model, &encoding, inputs, self.density, &raster)?;
+                let at = (model, inputs.as_slice(), self.upscale);
+                self.refined(network, children, at, &IN_ORDER[1..=to])?
             }
             (_, None, _) => match set {
-                Set::Refined(parents) => self.finished(network, crops, parents)?,
+                Set::Refined(parents) => {
+                    let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
+                    self.finished(network, at, parents)?
+                }
+                Set::Smaller(smaller) => self.smaller(network, crops, smaller)?,
                 set => SceneChildren::of_splats(self.baseline(network, crops, set)?),
             },
         };
@@ -199,17 +257,17 @@ impl<'a> PictureMaker<'a> {
         Ok(())
     }
 
-    /// Takes `splats` through the steps `sets` of [`IN_ORDER`].
+    /// Takes the `children` of a model and of `inputs`, whose targets have `ratio` times their side,
+    /// through the steps `sets` of [`IN_ORDER`].
     fn refined(
         &self,
         network: &Network<'_>,
         mut children: SceneChildren,
-        crops: &Crops,
+        (model, inputs, ratio): (&SubSplat, &[Cropped], f32),
         sets: &[Set],
     ) -> Result<SceneChildren> {
-        let inputs = &crops.inputs;
-        let upscale = network.model.config().upscale;
-        let raster = self.raster_options(network, self.upscale, None);
+        let upscale = model.config().upscale;
+        let raster = self.raster_options(network, ratio, None);
         let mut renderer = Renderer::default();
         for set in sets {
             let renderer = &mut renderer;
@@ -232,60 +290,60 @@ impl<'a> PictureMaker<'a> {
     /// The Gaussians of a baseline.
     fn baseline(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
         match set {
-            Set::RefinedParents => self.refined_parents(network, crops),
             Set::Pair(pair) => network.splats_of_pair(pair, crops),
             Set::Opaque | Set::Random => self.reduced(network, crops, set),
             _ => network.splats(set, self.upscale.ceil() as usize),
         }
     }
 
-    /// The Gaussians that `run` makes, of `parents`.
-    fn finished(
+    /// The Gaussians that `run` makes for pictures of a smaller size.
+    fn smaller(
         &self,
         network: &Network<'_>,
         crops: &Crops,
+        smaller: Smaller,
+    ) -> Result<SceneChildren> {
+        let ratio = smaller.ratio(self.upscale);
+        let model = network.model.model().clone().with_upscale(ratio.ceil() as usize)?;
+        let inputs = crops.inputs.iter().map(|c| reduced(c, ratio)).collect::<Result<Vec<_>>>()?;
+        self.finished(network, (&model, &inputs, ratio), Parents::Matched)
+    }
+
+    /// The Gaussians that `run` makes, of `parents`, by a model and for `inputs`, whose targets have
+    /// `ratio` times their side.
+    fn finished(
+        &self,
+        network: &Network<'_>,
+        (model, inputs, ratio): (&SubSplat, &[Cropped], f32),
         parents: Parents,
     ) -> Result<SceneChildren> {
-        let inputs = &crops.inputs;
         let mut renderer = Renderer::default();
         let small = self.raster_options(network, 1.0, None);
         let mut encoding = network.encoding();
-        let model = network.model.model();
         let mut own = encoding.parents(model)?;
         let mut part = |_: f32| ControlFlow::Continue(());
         if parents == Parents::Matched {
             let near_far = self.bounds.near_far();
             match_parents(&mut own, inputs, near_far, &mut part)?;
         }
-        let options = Refine::Auto.options_for(inputs.len(), own.len(), true);
+        let options = Refine::Auto.options_for(inputs.len(), true);
         let options =
             options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
         if let Some(options) = options {
             refine_parents(&mut own, inputs, &small, &options, &mut renderer, &mut part)?;
         }
         encoding = encoding.with_parents(model, &own)?;
-        let mut children = network.children(&encoding, inputs, self.density, &small)?;
+        let mut children = network.children(model, &encoding, inputs, self.density, &small)?;
         children.add_offsets(&own);
-        let mut children = self.refined(network, children, crops, &IN_ORDER[1..])?;
+        let at = (model, inputs, ratio);
+        let mut children = self.refined(network, children, at, &IN_ORDER[1..])?;
         let SceneChildren { splats, groups, .. } = &mut children;
-        let raster = self.raster_options(network, self.upscale, None);
-        // As `run`: none of more Gaussians than `Auto` refines.
-        let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
+        let raster = self.raster_options(network, ratio, None);
+        let options = Refine::Auto.options_for(inputs.len(), true);
         let mut step = |_: &PhaseRun<'_>| ControlFlow::Continue(());
         let renderer = &mut renderer;
         refine_on_inputs(splats, groups, inputs, &raster, &options, renderer, &mut step)?;
         Ok(children)
-    }
-
-    /// The network's Gaussians, one a pixel, fitted to and refined on the photographs of the input's size.
-    fn refined_parents(&self, network: &Network<'_>, crops: &Crops) -> Result<Splats> {
-        let small = self.raster_options(network, 1.0, None);
-        let mut parents = network.splats(Set::Parents, 1)?;
-        let options = Refine::Auto.options_for(crops.inputs.len(), parents.len(), true);
-        let mut part = |_: f32| ControlFlow::Continue(());
-        let renderer = &mut Renderer::default();
-        refine_parents(&mut parents, &crops.inputs, &small, &options, renderer, &mut part)?;
-        Ok(parents)
     }
 
     /// The Gaussians of [`Set::Detailed`] at full density, as many as the density allows: those of
@@ -293,7 +351,9 @@ impl<'a> PictureMaker<'a> {
     fn reduced(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
         let raster = self.raster_options(network, 1.0, None);
         let encoding = network.encoding();
-        let mut children = network.children(&encoding, &crops.inputs, Density::Full, &raster)?;
+        let model = network.model.model();
+        let mut children =
+            network.children(model, &encoding, &crops.inputs, Density::Full, &raster)?;
         let upscale = network.model.config().upscale;
         children.add_detail(&crops.inputs, upscale)?;
         let splats = children.splats;
@@ -320,10 +380,15 @@ impl<'a> PictureMaker<'a> {
             Method::Mean => mean(&crops.inputs, size),
             Method::Lowpass => self.render(camera, r, Some(LowpassRef::Input)),
             Method::Backbone => self.render(camera, r, Some(LowpassRef::Target)),
-            Method::Enlarged => {
-                let small = self.render(&target.input_camera, 1.0, None);
-                let (w, h) = (target.input.width, target.input.height);
-                let Some(small) = Rgb::from_unit(&small, w, h) else { return Vec::new() };
+            Method::Enlarged | Method::Half => {
+                let ratio = Smaller::of(method).map_or(1.0, |smaller| smaller.ratio(r));
+                let Ok(Cropped { target: small, target_camera, .. }) = reduced(target, ratio)
+                else {
+                    return Vec::new();
+                };
+                let picture = self.render(&target_camera, ratio, None);
+                let (w, h) = (small.width, small.height);
+                let Some(small) = Rgb::from_unit(&picture, w, h) else { return Vec::new() };
                 resize(&small, size.0, size.1, Filter::Lanczos).to_unit()
             }
             Method::Bilinear => {
@@ -365,16 +430,16 @@ impl Network<'_> {
         SceneEncoding::new(self.views.clone(), self.output.clone(), self.parents.clone())
     }
 
-    /// The model's Gaussians of the primaries in `encoding`, without detail. `raster` renders pictures of
+    /// The Gaussians of `network` of the primaries in `encoding`, without detail. `raster` renders pictures of
     /// the input's size.
     fn children(
         &self,
+        network: &SubSplat,
         encoding: &SceneEncoding,
         inputs: &[Cropped],
         density: Density,
         raster: &RasterOptions,
     ) -> Result<SceneChildren> {
-        let network = self.model.model();
         let mut renderer = Renderer::default();
         let counts = counts_of(network, encoding, inputs, density, raster, &mut renderer)?;
         Ok(SceneChildren::new(network, encoding, inputs.len(), counts, &|| Ok(()))?)

@@ -36,8 +36,9 @@ impl SceneFormatArg {
 pub struct ContentArgs {
     /// Variation of a splat's colour with the viewing direction: degree of the spherical harmonics, 0 to 3.
     ///
-    /// 0 gives a splat one colour for all views and the smallest file. Default: 3, which viewers
-    /// expect. A .ply holds 0, 9, 24 or 45 values `f_rest` accordingly.
+    /// 0 gives a splat one colour for all views and the smallest file. A .ply holds 0, 9, 24 or 45
+    /// values `f_rest` accordingly. Default: 3, which some viewers expect, and the scene's own degree
+    /// where the .ply is larger than 150 MB with 3.
     #[arg(
         long,
         value_name = "0…3",

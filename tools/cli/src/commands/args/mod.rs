@@ -25,7 +25,7 @@ pub use info::InfoArgs;
 pub use poses::PosesArgs;
 pub use render::RenderArgs;
 pub use rendering::{ConventionArg, LowpassArg, MotionArgs, PATH_FRAMES, PathArg, RenderingArgs};
-pub use run::RunArgs;
+pub use run::{PictureSizeArg, RunArgs};
 pub use source::{
     BackboneArg, CropShapeArg, DetailArg, InputSizeArg, MatchingArg, ModelArgs, PresetArg,
     QualityArg, SourceArgs,

@@ -3,7 +3,7 @@
 use super::files::{ContentArgs, SceneFormatArg};
 use super::groups::{PICTURES, SIZE};
 use super::rendering::{MotionArgs, PathArg, RenderingArgs};
-use super::source::SourceArgs;
+use super::source::{QualityArg, SourceArgs};
 use crate::commands::values;
 use clap::Args;
 use std::path::PathBuf;
@@ -51,25 +51,41 @@ pub struct RunArgs {
     /// Options of the reconstruction.
     #[command(flatten)]
     pub source: SourceArgs,
-    /// Size of the pictures in pixels: 1920x1080, or N for NxN.
+    /// Size of the pictures in pixels: 1920x1080, N for NxN, or `photo`.
     ///
     /// The photographs are cropped to this shape. Without --upscale the scene has as many splats as
-    /// these pictures need (at most 64 for each pixel that the network reads).
+    /// these pictures need (at most 64 for each pixel that the network reads). `photo`: the
+    /// photographs' own size, at most four megapixels; default with `--quality best`.
     #[arg(
         long,
-        value_name = "N | WxH",
-        value_parser = values::size,
+        value_name = "N | WxH | photo",
+        value_parser = values::picture_size,
         display_order = 0,
         help_heading = SIZE
     )]
-    pub size: Option<(usize, usize)>,
+    pub size: Option<PictureSizeArg>,
+}
+
+/// Size of the pictures of a scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PictureSizeArg {
+    /// Width and height, px.
+    Sides(usize, usize),
+    /// That of the photographs.
+    Photo,
 }
 
 impl RunArgs {
-    /// Size of the pictures: --size, else --upscale times the input.
+    /// Size of the pictures: --size, else --upscale times the input; with the best quality that of the
+    /// photographs.
     pub fn target_size(&self) -> TargetSize {
+        let best = self.source.quality == QualityArg::Best && self.source.upscale.is_none();
         match self.size {
-            Some((width, height)) => TargetSize::Exact(Size::new(width, height)),
+            Some(PictureSizeArg::Sides(width, height)) => {
+                TargetSize::Exact(Size::new(width, height))
+            }
+            Some(PictureSizeArg::Photo) => TargetSize::Photographs,
+            None if best => TargetSize::Photographs,
             None => self.source.target_size(),
         }
     }

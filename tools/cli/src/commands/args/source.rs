@@ -71,7 +71,8 @@ pub struct SourceArgs {
     ///
     /// Even surfaces keep one splat for each pixel that the network reads, and surfaces with detail get
     /// the rest. A share is one of all splats that --upscale gives. 3/px gives each pixel three. auto:
-    /// all splats of two photographs; of more photographs, 2.5 times the splats of one.
+    /// all splats of two photographs; of more photographs, 2.5 times the splats of one; 950,000 at
+    /// most.
     #[arg(
         long,
         value_name = "N",
@@ -103,8 +104,8 @@ pub struct SourceArgs {
     ///
     /// These steps follow those of --fit. Each step draws one photograph from the splats, and changes the
     /// splats towards it. `off`; a number of steps; or a time, such as `20s`. `auto`: eight steps a
-    /// photograph, 64 at most, and none for more than 1.5 million splats. The steps end early where
-    /// photographs, drawn from the splats of the other photographs, no longer improve.
+    /// photograph, 64 at most. The steps end early where photographs, drawn from the splats of the
+    /// other photographs, no longer improve.
     #[arg(
         long,
         value_name = "auto | off | STEPS | SECONDSs",
@@ -193,12 +194,10 @@ pub enum QualityArg {
     Fast,
     /// 256 x 256 pixels are read, and --gaussians and --refine are `auto`.
     Normal,
-    /// Up to 512 x 512 pixels are read, with at most 1.5 million splats. Small photographs or little
-    /// memory reduce this. Takes twice the time of normal, and 1.3 GiB for two photographs. Sharper where
-    /// the photographs overlap by 90 % or more; elsewhere new views gain nothing.
+    /// Up to 512 x 512 pixels are read. Small photographs or little memory reduce this.
     High,
-    /// As `high`, with twice the steps of --refine: three times the time of normal. Closest to the
-    /// photographs; new views gain little.
+    /// As `high`, with twice the steps of --refine, and pictures of the photographs' size (--size photo)
+    /// where neither --size nor --upscale is given.
     Best,
 }
 

@@ -7,6 +7,7 @@ use super::Room;
 use super::cameras::{CameraRange, CameraSpec, Rig, sample_cameras};
 use super::render::{Grade, Quality, View};
 use super::rng::Rng;
+use super::texture::TextureBank;
 use subsplat_kernels::camera::Camera;
 
 /// Contents of an example.
@@ -27,6 +28,9 @@ pub struct ExampleSpec {
     pub wide: f32,
     /// Samples along each side of a pixel.
     pub samples: usize,
+    /// Textures of [`TextureBank::fine`] in furnished rooms, for large pictures; else of
+    /// [`TextureBank::shared`].
+    pub fine_textures: bool,
 }
 
 impl ExampleSpec {
@@ -36,7 +40,15 @@ impl ExampleSpec {
         let range = CameraRange::HandHeld;
         let cameras = CameraSpec { width, height, targets, crop: 0.5, range };
         let (foreground, scattered, wide) = (0.0, 0.0, 0.0);
-        Self { cameras, photographic: true, foreground, scattered, wide, samples: 2 }
+        Self {
+            cameras,
+            photographic: true,
+            foreground,
+            scattered,
+            wide,
+            samples: 2,
+            fine_textures: false,
+        }
     }
 }
 
@@ -126,7 +138,11 @@ impl Example {
             let scattered = variety.chance(spec.scattered);
             let wide = variety.chance(spec.wide);
             let range = if wide { CameraRange::Wide } else { spec.cameras.range };
-            let mut room = if scattered { Room::scattered(seed) } else { Room::new(seed) };
+            let mut room = match (scattered, spec.fine_textures) {
+                (true, _) => Room::scattered(seed),
+                (false, true) => Room::with_bank(seed, TextureBank::fine()),
+                (false, false) => Room::new(seed),
+            };
             if let Some(mut rig) =
                 sample_cameras(&room, seed, &CameraSpec { range, ..spec.cameras })
             {

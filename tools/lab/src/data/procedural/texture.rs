@@ -159,17 +159,21 @@ impl std::fmt::Debug for TextureBank {
 
 /// Side of the shared bank's textures, px.
 const SHARED_SIZE: usize = 256;
+/// Largest side of a texture, px.
+const SIZE_MAX: usize = 2048;
 /// Seed of the shared bank: rooms of the same seed are equal in every process.
 const SHARED_SEED: u64 = 0;
 
 static SHARED: LazyLock<Arc<TextureBank>> =
     LazyLock::new(|| Arc::new(TextureBank::new(SHARED_SEED, SHARED_SIZE)));
+static FINE: LazyLock<Arc<TextureBank>> =
+    LazyLock::new(|| Arc::new(TextureBank::new(SHARED_SEED, SIZE_MAX)));
 
 impl TextureBank {
     /// Creates a bank of 144 textures without synthesising them. `size` (px) is rounded up to a
     /// power of two from 64 to 2048. A synthesised texture takes 4 bytes × 4/3 × size².
     pub fn new(seed: u64, size: usize) -> Self {
-        let size = size.clamp(64, 2048).next_power_of_two();
+        let size = size.clamp(64, SIZE_MAX).next_power_of_two();
         Self { seed, size, slots: (0..BANK).map(|_| OnceLock::new()).collect() }
     }
 
@@ -177,6 +181,12 @@ impl TextureBank {
     /// synthesised.
     pub fn shared() -> Arc<Self> {
         Arc::clone(&SHARED)
+    }
+
+    /// Returns a bank of 2048² textures, for pictures of 512 pixels and more: 22 MB for each texture
+    /// that a scene shows.
+    pub fn fine() -> Arc<Self> {
+        Arc::clone(&FINE)
     }
 
     /// Returns texture `index`, modulo the bank's size.
