@@ -24,7 +24,7 @@ use rayon::prelude::*;
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[non_exhaustive]
 pub enum Density {
-    /// [`Density::Full`] of two photographs, at most [`AUTO_GAUSSIANS`]. More photographs share the
+    /// [`Density::Full`] of two photographs, at most 950,000. More photographs share the
     /// Gaussians of two and a half.
     #[default]
     Auto,
@@ -75,10 +75,11 @@ impl Density {
 const AUTO_PHOTOGRAPHS: f64 = 2.5;
 
 /// Most Gaussians of [`Density::Auto`]: a .ply of degree 1 then stays below 100 MB, and the refinement of
-/// two photographs to 1024² takes 1.1 GiB instead of 1.6. Generated rooms 4 and 1 at 256 → 1024 (`make_rooms`, seed 78), refined:
-/// 33.18 / .954 and 35.05 / .960 (PSNR / SSIM of new views) with 600,000, 33.57 / .954 and 35.09 / .960 with
-/// a million, 33.63 / .954 and 35.31 / .960 with all 2.1 million, in 36, 43 and 70 s.
-pub const AUTO_GAUSSIANS: usize = 950_000;
+/// two photographs to 1024² takes 1.1 GiB instead of 1.6. Generated rooms 4 and 1 at 256 → 1024
+/// (`make_rooms` with seed 78), refined, PSNR / SSIM of new views: with 600,000 Gaussians 33.18 / .954 and
+/// 35.05 / .960, with a million 33.57 / .954 and 35.09 / .960, with all 2.1 million 33.63 / .954 and 35.31 / .960;
+/// in 36, 43 and 70 s on two cores.
+const AUTO_GAUSSIANS: usize = 950_000;
 
 /// Grids of a pixel, by their sides: 1, the powers of two below r that divide r, and r.
 pub(crate) fn grids(r: usize) -> Vec<usize> {

@@ -296,13 +296,10 @@ pub enum TargetSize {
     Times(f32),
     /// These sides, px. The input has their shape where [`Options::input_size`] leaves it open.
     Exact(Size),
-    /// The largest pictures of the input's shape that enlarge no photograph, of four megapixels at
-    /// most; [`TargetSize::Upscaled`] where that is larger.
-    Photographs,
+    /// The largest pictures of the input's shape that enlarge no photograph, of at most this number of
+    /// pixels; [`TargetSize::Upscaled`] where that is larger.
+    Photographs(usize),
 }
-
-/// Most pixels of [`TargetSize::Photographs`].
-const PHOTOGRAPHS_AREA: f64 = 4e6;
 
 impl TargetSize {
     /// The size for an input of `input_size`, a model of `upscale`, and photographs of the sizes
@@ -311,10 +308,10 @@ impl TargetSize {
     pub fn resolve(self, input_size: Size, upscale: usize, photos: &[Size]) -> Size {
         let Size { width, height } = input_size;
         match self {
-            Self::Photographs => {
+            Self::Photographs(area) => {
                 let (w, h) = (width.max(1) as f64, height.max(1) as f64);
                 let covers = |p: &Size| (p.width as f64 / w).min(p.height as f64 / h);
-                let most = (PHOTOGRAPHS_AREA / (w * h)).sqrt();
+                let most = (area as f64 / (w * h)).sqrt();
                 let factor = photos.iter().map(covers).fold(most, f64::min).max(upscale as f64);
                 Size::new((factor * w) as usize, (factor * h) as usize)
             }
@@ -485,7 +482,7 @@ mod tests {
     fn pictures_of_the_photographs_size() {
         let size = |photos: &[(usize, usize)]| {
             let photos: Vec<Size> = photos.iter().map(|(w, h)| Size::new(*w, *h)).collect();
-            let size = TargetSize::Photographs.resolve(Size::new(288, 224), 2, &photos);
+            let size = TargetSize::Photographs(4_000_000).resolve(Size::new(288, 224), 2, &photos);
             (size.width, size.height)
         };
         // Two megapixels of another shape; a smaller second photograph; twelve megapixels; small ones.

@@ -294,7 +294,7 @@ fn bytes_at_most(format: SceneFormatArg, count: u64, stored: usize, asked: Optio
 /// large files. The scene has at most `count` Gaussians with SH of `degree`.
 pub fn check_formats(args: &RunArgs, count: u64, degree: usize) -> Result<()> {
     for format in &args.save {
-        let written = sh_degree(args, count, degree);
+        let written = written_degree(args.content.sh, count, degree);
         let bytes = bytes_at_most(*format, count, degree, written);
         check_format(*format, count, bytes, args.content.min_opacity)?;
         if *format == SceneFormatArg::Ply && bytes > ANNOUNCED {
@@ -314,12 +314,12 @@ pub fn check_formats(args: &RunArgs, count: u64, degree: usize) -> Result<()> {
     Ok(())
 }
 
-/// Degree of the SH that the files of a scene of `count` Gaussians with SH of `degree` have; `None` leaves
-/// it to the format.
-pub fn sh_degree(args: &RunArgs, count: u64, degree: usize) -> Option<usize> {
+/// Degree of the SH that the files of a scene of `count` Gaussians with SH of `degree` have, of which
+/// `asked` are asked for; `None` leaves it to the format.
+pub fn written_degree(asked: Option<usize>, count: u64, degree: usize) -> Option<usize> {
     let padded = bytes_at_most(SceneFormatArg::Ply, count, degree, None);
     let own = (padded > PLY_PADDED_MAX).then_some(degree.min(3));
-    args.content.sh.or(own)
+    asked.or(own)
 }
 
 /// [`check_formats`] of one file. A least opacity may leave fewer Gaussians, so that nothing is
@@ -399,5 +399,14 @@ mod tests {
         assert!(check(Ply, 20_000_000, 0.0).is_ok());
         assert_eq!(bytes_at_most(Ply, 2_097_152, 1, None), 520_093_696);
         assert_eq!(bytes_at_most(Ply, 1000, 1, Some(0)), 68_000);
+        // All splats of two photographs at twice the input's size keep the 45 values.
+        assert_eq!(written_degree(None, 524_288, 1), None);
+        let most = subsplat::Density::Auto.limit(1 << 20, 2, 2) as u64;
+        assert_eq!(written_degree(None, most, 1), Some(1));
+        assert!(bytes_at_most(Ply, most, 1, Some(1)) < 100_000_000);
+        assert_eq!(
+            (written_degree(Some(3), most, 1), written_degree(None, most, 4)),
+            (Some(3), Some(3))
+        );
     }
 }

@@ -55,7 +55,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let (mut size, (w, h)) = reconstruct::input_size(source, target, &model, &plan.scene, context)?;
     let target = match target {
         // The number of children follows from the size of the pictures, not the other way round.
-        TargetSize::Photographs => {
+        TargetSize::Photographs(_) => {
             size = InputSize::exact(w, h);
             let photos = reconstruct::photo_sizes(&plan.scene, context);
             TargetSize::Exact(target.resolve(Size::new(w, h), model.config().upscale, &photos))
@@ -66,8 +66,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     (plan.options.input_size, plan.options.target_size) = (size, target);
     let Size { width, height } = target.resolve(Size::new(w, h), model.config().upscale, &[]);
     let target_size = (width, height);
-    if args.target_size() == TargetSize::Photographs {
-        print_line(format!("pictures of {width}x{height} pixels, the size of the photographs"));
+    if matches!(args.target_size(), TargetSize::Photographs(_)) {
+        print_line(format!("pictures of {width}x{height} pixels"));
     }
     let targets = targets(args, &plan, target_size)?;
     memory::check_picture("the picture size", target_size)?;
@@ -96,7 +96,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
         let comments = std::iter::once(comment_of_options(&options)).chain(camera).collect();
         let save = SaveOptions {
-            sh_degree: output::sh_degree(args, count, degree),
+            sh_degree: output::written_degree(args.content.sh, count, degree),
             min_opacity: args.content.min_opacity,
             comments,
             ..SaveOptions::default()

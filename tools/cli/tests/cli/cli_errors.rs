@@ -179,7 +179,7 @@ fn wrong_usage_is_exit_code_2() {
 #[test]
 fn impossible_values_are_wrong_usage() {
     let place = tempfile::tempdir().unwrap();
-    let rows: [Row; 28] = [
+    let rows: [Row; 29] = [
         ("run scene --upscale 0", "--upscale <R>': expected a number from 1 to 8"),
         ("run scene --upscale 9", "from 1 to 8"),
         ("run scene --frames 0 --path orbit", "from 1 to 100000"),
@@ -207,6 +207,7 @@ fn impossible_values_are_wrong_usage() {
         ("render a.ply --sh-degree 5", "from 0 to 4"),
         ("render a.ply --near 0", "above 0"),
         ("render a.ply --size 0x5", "N or WxH"),
+        ("run scene --size huge", "N or WxH, 1 to 32768 pixels a side, or `photo`"),
         ("render a.ply --frames 0", "from 1 to 100000"),
     ];
     for (arguments, named) in rows {

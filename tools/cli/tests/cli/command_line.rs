@@ -204,6 +204,13 @@ fn sizes_between_whole_upscales_and_fewer_gaussians() {
     assert_eq!(report["upscale"], 3);
     assert_eq!(report["target_size"], serde_json::json!([80, 96]));
     assert_eq!((picture().width, picture().height), (80, 96));
+    // The photographs have 128x128 pixels.
+    for more in ["--size photo", "--quality best"] {
+        let report = run(more);
+        assert_eq!(report["target_size"], serde_json::json!([128, 128]), "{more}");
+        assert_eq!((&report["upscale"], picture().width), (&4.into(), 128), "{more}");
+    }
+    assert_eq!(run("--quality best --upscale 2")["target_size"], serde_json::json!([64, 64]));
     for (gaussians, least, most) in [("25%", 8000, 8192), ("3000", 2990, 3000), ("100", 100, 100)] {
         let report = run(&format!("--upscale 4 --gaussians {gaussians}"));
         let count = report["gaussians"].as_u64().unwrap();

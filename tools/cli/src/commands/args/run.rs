@@ -55,7 +55,7 @@ pub struct RunArgs {
     ///
     /// The photographs are cropped to this shape. Without --upscale the scene has as many splats as
     /// these pictures need (at most 64 for each pixel that the network reads). `photo`: the
-    /// photographs' own size, at most four megapixels; default with `--quality best`.
+    /// photographs' own size, at most four megapixels.
     #[arg(
         long,
         value_name = "N | WxH | photo",
@@ -65,6 +65,11 @@ pub struct RunArgs {
     )]
     pub size: Option<PictureSizeArg>,
 }
+
+/// Most pixels of `--size photo`.
+const PHOTO_PIXELS: usize = 4_000_000;
+/// Most pixels of `--quality best` without a size: twice as many take twice the time.
+const BEST_PIXELS: usize = 1920 * 1080;
 
 /// Size of the pictures of a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -84,8 +89,8 @@ impl RunArgs {
             Some(PictureSizeArg::Sides(width, height)) => {
                 TargetSize::Exact(Size::new(width, height))
             }
-            Some(PictureSizeArg::Photo) => TargetSize::Photographs,
-            None if best => TargetSize::Photographs,
+            Some(PictureSizeArg::Photo) => TargetSize::Photographs(PHOTO_PIXELS),
+            None if best => TargetSize::Photographs(BEST_PIXELS),
             None => self.source.target_size(),
         }
     }

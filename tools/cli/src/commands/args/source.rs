@@ -196,8 +196,8 @@ pub enum QualityArg {
     Normal,
     /// Up to 512 x 512 pixels are read. Small photographs or little memory reduce this.
     High,
-    /// As `high`, with twice the steps of --refine, and pictures of the photographs' size (--size photo)
-    /// where neither --size nor --upscale is given.
+    /// As `high`, with twice the steps of --refine, and pictures of the photographs' own size, at most
+    /// two megapixels, where neither --size nor --upscale is given.
     Best,
 }
 
