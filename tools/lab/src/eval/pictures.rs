@@ -296,7 +296,8 @@ impl<'a> PictureMaker<'a> {
         }
     }
 
-    /// The Gaussians that `run` makes for pictures of a smaller size.
+    /// The Gaussians that `run` makes for pictures of a smaller size. Heads for one number of children do
+    /// not serve that size: the parents then have no children.
     fn smaller(
         &self,
         network: &Network<'_>,
@@ -304,9 +305,25 @@ impl<'a> PictureMaker<'a> {
         smaller: Smaller,
     ) -> Result<SceneChildren> {
         let ratio = smaller.ratio(self.upscale);
+        if !network.model.config().spgr.head.serves_any_k() {
+            return Ok(SceneChildren::of_splats(self.refined_parents(network, crops)?));
+        }
         let model = network.model.model().clone().with_upscale(ratio.ceil() as usize)?;
         let inputs = crops.inputs.iter().map(|c| reduced(c, ratio)).collect::<Result<Vec<_>>>()?;
         self.finished(network, (&model, &inputs, ratio), Parents::Matched)
+    }
+
+    /// The network's Gaussians, one a pixel, matched, and refined on the photographs of the input's size.
+    fn refined_parents(&self, network: &Network<'_>, crops: &Crops) -> Result<Splats> {
+        let inputs = &crops.inputs;
+        let small = self.raster_options(network, 1.0, None);
+        let mut parents = network.encoding().parents(network.model.model())?;
+        let mut part = |_: f32| ControlFlow::Continue(());
+        match_parents(&mut parents, inputs, self.bounds.near_far(), &mut part)?;
+        let options = Refine::Auto.options_for(inputs.len(), true);
+        let renderer = &mut Renderer::default();
+        refine_parents(&mut parents, inputs, &small, &options, renderer, &mut part)?;
+        Ok(parents)
     }
 
     /// The Gaussians that `run` makes, of `parents`, by a model and for `inputs`, whose targets have
