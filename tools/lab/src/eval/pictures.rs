@@ -64,7 +64,7 @@ enum Set {
     Fitted,
     /// Refined children of parents that were prepared before.
     Refined(Parents),
-    /// What `run` gives at a smaller size.
+    /// The Gaussians of `run` for pictures of a smaller size.
     Smaller(Smaller),
     /// The children of two inputs alone, with detail.
     Pair([usize; 2]),
@@ -118,22 +118,17 @@ impl Smaller {
 
 /// `c` with a target of `ratio` times the input's sides.
 fn reduced(c: &Cropped, ratio: f32) -> Result<Cropped> {
-    if ratio == 1.0 {
-        let scale = Vec2::new(
-            c.target.width as f32 / c.input.width as f32,
-            c.target.height as f32 / c.input.height as f32,
-        );
-        let window = PhotoWindow { scale: c.window.scale * scale, ..c.window };
-        let (target, target_camera) = (c.input.clone(), c.input_camera);
-        return Ok(Cropped { target, target_camera, window, ..c.clone() });
-    }
-    let side = |side: usize| (side as f32 * ratio).round() as usize;
-    let (w, h) = (side(c.input.width), side(c.input.height));
-    let k = c.target_camera.intrinsics().resized(w, h);
-    let target_camera = c.target_camera.with_intrinsics(k)?;
-    let target = resize(&c.target, w, h, Filter::Lanczos);
-    let scale = Vec2::new(c.target.width as f32 / w as f32, c.target.height as f32 / h as f32);
-    let window = PhotoWindow { scale: c.window.scale * scale, ..c.window };
+    let (target, target_camera) = if ratio == 1.0 {
+        (c.input.clone(), c.input_camera)
+    } else {
+        let side = |side: usize| (side as f32 * ratio).round() as usize;
+        let (w, h) = (side(c.input.width), side(c.input.height));
+        let camera = c.target_camera.with_intrinsics(c.target_camera.intrinsics().resized(w, h))?;
+        (resize(&c.target, w, h, Filter::Lanczos), camera)
+    };
+    let size = |p: &Rgb| Vec2::new(p.width as f32, p.height as f32);
+    let scale = c.window.scale * (size(&c.target) / size(&target));
+    let window = PhotoWindow { scale, ..c.window };
     Ok(Cropped { target, target_camera, window, ..c.clone() })
 }
 

@@ -190,9 +190,9 @@ const fn at_target_size(name: &'static str) -> Row {
     Row { name, source: Source::MethodAtTargetSize(Weights::Mvsplat, "backbone") }
 }
 
-/// What `subsplat run` gives.
+/// The pictures of `subsplat run`.
 const REFINED: Row = subsplat("SubSplat, fitted and refined", "refine");
-/// What `subsplat run` gives at the input's size, enlarged: the strongest rival of children.
+/// The same at the input's size, enlarged: the strongest rival of children.
 const ENLARGED: Row = subsplat("SubSplat at the input's size, refined + Lanczos", "enlarged");
 
 /// Rows of Table 1, which its figures show too.
