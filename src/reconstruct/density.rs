@@ -42,14 +42,8 @@ impl Density {
     /// Returns whether each of `parents` parents of `photographs` photographs has r² children,
     /// r = `upscale`.
     pub(crate) fn is_full(self, parents: usize, photographs: usize, upscale: usize) -> bool {
-        match self {
-            Self::Auto => {
-                let full = parents.saturating_mul(upscale * upscale);
-                photographs <= 2 && full <= AUTO_GAUSSIANS
-            }
-            Self::Full => true,
-            Self::Share(_) | Self::Count(_) | Self::Each(_) => false,
-        }
+        let full = parents.saturating_mul(upscale * upscale);
+        matches!(self, Self::Auto | Self::Full) && self.limit(parents, photographs, upscale) == full
     }
 
     /// Returns the largest number of Gaussians for `parents` of `photographs` photographs and
@@ -57,10 +51,9 @@ impl Density {
     pub fn limit(self, parents: usize, photographs: usize, upscale: usize) -> usize {
         let full = parents.saturating_mul(upscale * upscale);
         match self {
-            Self::Auto if photographs <= 2 => full.min(AUTO_GAUSSIANS),
             Self::Auto => {
                 let shared = full as f64 * AUTO_PHOTOGRAPHS / photographs as f64;
-                (shared.round() as usize).min(AUTO_GAUSSIANS)
+                (shared.round() as usize).min(full).min(AUTO_GAUSSIANS)
             }
             Self::Full => full,
             Self::Share(share) => (f64::from(share.clamp(0.0, 1.0)) * full as f64).round() as usize,

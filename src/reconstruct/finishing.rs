@@ -1,7 +1,6 @@
 //! Fit and refinement of a reconstructed scene on its photographs.
 
 use super::{Error, Refine, Result};
-use crate::files::photos::resize::{Filter, resize};
 use crate::finish::{
     FinishError, FitOptions, FitReport, Groups, PhaseRun, RefineOptions, RefineReport, TargetView,
     check_time, fit, refine_groups,
@@ -12,7 +11,7 @@ use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use std::borrow::Cow;
 use std::ops::ControlFlow;
-use subsplat_kernels::camera::Camera;
+use subsplat_kernels::camera::{Camera, Size};
 use subsplat_kernels::clock::HAS_CLOCK;
 use subsplat_kernels::layout::RasterOptions;
 
@@ -31,15 +30,14 @@ impl<'a> SharpPicture<'a> {
             return Self { camera: c.target_camera, image: Cow::Borrowed(&c.target) };
         }
         let side = |side: usize| (side as f32 * scale).round() as usize;
-        let (width, height) = (side(c.target.width), side(c.target.height));
-        let camera = c.target_camera.intrinsics().resized(width, height);
-        match c.target_camera.with_intrinsics(camera) {
-            Ok(camera) if width > c.input.width && height > c.input.height => {
-                let image = resize(&c.target, width, height, Filter::Lanczos);
-                Self { camera, image: Cow::Owned(image) }
-            }
-            _ => Self { camera: c.input_camera, image: Cow::Borrowed(&c.input) },
+        let size = Size::new(side(c.target.width), side(c.target.height));
+        if size.width > c.input.width
+            && size.height > c.input.height
+            && let Ok((image, camera)) = c.resized(size)
+        {
+            return Self { camera, image: Cow::Owned(image) };
         }
+        Self { camera: c.input_camera, image: Cow::Borrowed(&c.input) }
     }
 
     fn view(&self) -> TargetView<'_> {

@@ -118,6 +118,16 @@ impl Cropped {
         let area = |p: &Rgb| (p.width * p.height).max(1) as f32;
         (area(&self.target) / area(&self.input)).sqrt()
     }
+
+    /// The photograph at `size` instead of the target's, and its camera.
+    ///
+    /// # Errors
+    /// A size that no camera can have.
+    pub fn resized(&self, Size { width, height }: Size) -> Result<(Rgb, Camera)> {
+        let k = self.target_camera.intrinsics().resized(width, height);
+        let camera = with_intrinsics(&self.target_camera, k)?;
+        Ok((resize(&self.target, width, height, Filter::Lanczos), camera))
+    }
 }
 
 /// Resize and crop of one picture: the resampled size, the window's corner in it, and
@@ -233,18 +243,18 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
             (plan.picture(photo), plan.intrinsics(k, options.rule))
         }
     };
-    let with = |k: Intrinsics| {
-        let refused =
-            |e: CameraError| Error::format("crop", "a valid resized camera", e.to_string());
-        camera.with_intrinsics(k).map_err(refused)
-    };
     Ok(Cropped {
         input,
-        input_camera: with(input_k)?,
+        input_camera: with_intrinsics(camera, input_k)?,
         target,
-        target_camera: with(target_k)?,
+        target_camera: with_intrinsics(camera, target_k)?,
         window: plan.window(size),
     })
+}
+
+fn with_intrinsics(camera: &Camera, k: Intrinsics) -> Result<Camera> {
+    let refused = |e: CameraError| Error::format("crop", "a valid resized camera", e.to_string());
+    camera.with_intrinsics(k).map_err(refused)
 }
 
 #[cfg(test)]

@@ -21,7 +21,7 @@ use subsplat::reconstruct::{Density, DepthBounds, Error, Reconstructor, Refine, 
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{Renderer, render_with};
 use subsplat::scene::splats::Splats;
-use subsplat_kernels::camera::Camera;
+use subsplat_kernels::camera::{Camera, Size};
 use subsplat_kernels::clock::Instant;
 use subsplat_kernels::cpu::Rasterizer;
 use subsplat_kernels::layout::RasterOptions;
@@ -122,9 +122,7 @@ fn reduced(c: &Cropped, ratio: f32) -> Result<Cropped> {
         (c.input.clone(), c.input_camera)
     } else {
         let side = |side: usize| (side as f32 * ratio).round() as usize;
-        let (w, h) = (side(c.input.width), side(c.input.height));
-        let camera = c.target_camera.with_intrinsics(c.target_camera.intrinsics().resized(w, h))?;
-        (resize(&c.target, w, h, Filter::Lanczos), camera)
+        c.resized(Size::new(side(c.input.width), side(c.input.height)))?
     };
     let size = |p: &Rgb| Vec2::new(p.width as f32, p.height as f32);
     let scale = c.window.scale * (size(&c.target) / size(&target));
