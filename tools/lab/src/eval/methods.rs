@@ -25,7 +25,7 @@ pub enum Method {
     Unmatched,
     /// [`Method::Fit`], refined on the photographs: the parents stay as predicted.
     Direct,
-    /// The model with detail on the two inputs nearest to the target alone.
+    /// [`Method::Refine`] on the two inputs nearest to the target alone.
     Pair,
     /// The Gaussians of [`Method::Detail`] at full density, without those of the least opacities: as
     /// many as [`super::Options::density`] allows.

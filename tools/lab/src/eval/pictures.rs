@@ -14,10 +14,10 @@ use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::inputs::crop::{Cropped, PhotoWindow};
 use subsplat::reconstruct::stages::{
-    SceneChildren, add_detail, counts_of, fit_to_inputs, match_parents, options_of_parents,
+    SceneChildren, counts_of, fit_to_inputs, match_parents, options_of_parents,
     refine_on_inputs, refine_parents,
 };
-use subsplat::reconstruct::{Density, DepthBounds, Error, Reconstructor, Refine, Result};
+use subsplat::reconstruct::{Density, DepthBounds, DepthRange, Error, Reconstructor, Refine, Result};
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{Renderer, render_with};
 use subsplat::scene::splats::Splats;
@@ -66,7 +66,7 @@ enum Set {
     Refined(Parents),
     /// The Gaussians of `run` for pictures of a smaller size.
     Smaller(Smaller),
-    /// The children of two inputs alone, with detail.
+    /// The Gaussians of `run` for two of the inputs.
     Pair([usize; 2]),
     Opaque,
     Random,
@@ -168,11 +168,10 @@ impl<'a> PictureMaker<'a> {
             (None, _) => None,
             (Some(method), None) => return Err(Error::argument(method.name(), "a model", "none")),
             (Some(_), Some(model)) => {
-                let (views, found) = model.views(&crops.inputs, bounds, crops.depth_range)?;
+                let (network, found) =
+                    Network::new(model, &crops.inputs, bounds, crops.depth_range)?;
                 bounds = found;
-                let output = model.model().encode(&views)?;
-                let parents = model.model().primaries(&views, &output)?;
-                Some(Network { model, views, output, parents })
+                Some(network)
             }
         };
         Ok(Self {
@@ -242,6 +241,7 @@ impl<'a> PictureMaker<'a> {
                     self.finished(network, at, parents)?
                 }
                 Set::Smaller(smaller) => self.smaller(network, crops, smaller)?,
+                Set::Pair(pair) => self.of_pair(network.model, crops, pair)?,
                 set => SceneChildren::of_splats(self.baseline(network, crops, set)?),
             },
         };
@@ -283,7 +283,6 @@ impl<'a> PictureMaker<'a> {
     /// The Gaussians of a baseline.
     fn baseline(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
         match set {
-            Set::Pair(pair) => network.splats_of_pair(pair, crops),
             Set::Opaque | Set::Random => self.reduced(network, crops, set),
             _ => network.splats(set, self.upscale.ceil() as usize),
         }
@@ -304,6 +303,19 @@ impl<'a> PictureMaker<'a> {
         let model = network.model.model().clone().with_upscale(ratio.ceil() as usize)?;
         let inputs = crops.inputs.iter().map(|c| reduced(c, ratio)).collect::<Result<Vec<_>>>()?;
         self.finished(network, (&model, &inputs, ratio), Parents::Matched)
+    }
+
+    /// The Gaussians that `run` makes of two of the inputs.
+    fn of_pair(
+        &self,
+        model: &Reconstructor,
+        crops: &Crops,
+        pair: [usize; 2],
+    ) -> Result<SceneChildren> {
+        let inputs = pair.map(|i| crops.inputs[i].clone());
+        let bounds = crops.bounds.clone();
+        let (network, _) = Network::new(model, &inputs, bounds, crops.depth_range)?;
+        self.finished(&network, (model.model(), &inputs, self.upscale), Parents::Matched)
     }
 
     /// The network's Gaussians, one a pixel, matched, and refined on the photographs of the input's size.
@@ -434,7 +446,20 @@ impl<'a> PictureMaker<'a> {
     }
 }
 
-impl Network<'_> {
+impl<'a> Network<'a> {
+    /// Runs the backbone on `inputs`. Returns also the depth range of its candidates.
+    fn new(
+        model: &'a Reconstructor,
+        inputs: &[Cropped],
+        bounds: DepthBounds,
+        range: DepthRange,
+    ) -> Result<(Self, DepthBounds)> {
+        let (views, bounds) = model.views(inputs, bounds, range)?;
+        let output = model.model().encode(&views)?;
+        let parents = model.model().primaries(&views, &output)?;
+        Ok((Self { model, views, output, parents }, bounds))
+    }
+
     /// The backbone's outputs and the primaries.
     fn encoding(&self) -> SceneEncoding {
         SceneEncoding::new(self.views.clone(), self.output.clone(), self.parents.clone())
@@ -474,18 +499,6 @@ impl Network<'_> {
         };
         let children = trunk.forward(&self.views, &self.output, &self.parents);
         Ok(children.and_then(|c| c.to_splats())?)
-    }
-
-    /// The children of two inputs alone, with detail.
-    fn splats_of_pair(&self, pair: [usize; 2], crops: &Crops) -> Result<Splats> {
-        let inputs = pair.map(|i| crops.inputs[i].clone());
-        let (model, network) = (self.model, self.model.model());
-        let (views, _) = model.views(&inputs, crops.bounds.clone(), crops.depth_range)?;
-        let output = network.encode(&views)?;
-        let parents = network.primaries(&views, &output)?;
-        let mut splats = network.trunk().forward(&views, &output, &parents)?.to_splats()?;
-        add_detail(&mut splats, &inputs, model.config().upscale)?;
-        Ok(splats)
     }
 }
 
