@@ -6,7 +6,7 @@
 //! | moves | opacity, size, colour | opacity, scales, colour, mean, rotation |
 //! | a step | on all photographs | on one photograph, in turn |
 //! | rates | constant | fall by a cosine |
-//! | kept where | the loss falls | pictures drawn from the other photographs' Gaussians improve |
+//! | kept where | the loss falls | the photographs improve, two of them drawn from the other's Gaussians |
 //!
 //! A new phase is another value of [`Phase`]. A new course of the rates is a variant of [`Schedule`].
 
@@ -115,9 +115,9 @@ pub(super) struct LossWeights {
 pub(super) enum Measure {
     /// The mean loss of the photographs.
     Loss,
-    /// The mean squared difference of each photograph, drawn from the other photographs' Gaussians
-    /// alone where these are known.
-    Others,
+    /// The mean squared difference of the photographs: each of two drawn from the other's Gaussians alone,
+    /// where these are known; more of them drawn from all Gaussians.
+    Difference,
 }
 
 /// Rule that ends the steps before their limit.
@@ -204,7 +204,7 @@ impl Phase {
             steps: options.steps,
             time: options.time,
             patience: Some(Patience { rounds: ROUNDS_PER_CHECK, least_gain: LEAST_GAIN }),
-            measure: Measure::Others,
+            measure: Measure::Difference,
             spares_edges: true,
             least_covered: LEAST_COVERED,
             least_share: options.least_share,

@@ -199,13 +199,13 @@ impl<'a> PhaseRun<'a> {
             let rows = self.optimiser.rows();
             let [error, covered] = match (self.phase.measure, self.group(view)) {
                 (Measure::Loss, _) => [target.loss(&draw(rows)).value, 1.0],
-                (Measure::Others, Some(group)) => {
+                (Measure::Difference, Some(group)) if self.targets.len() == 2 => {
                     let mut rows = rows.to_vec();
                     let own = &mut rows[group.start * SPLAT_STRIDE..group.end * SPLAT_STRIDE];
                     own.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
                     target.error_where_covered(&draw(&rows))
                 }
-                (Measure::Others, None) => [target.error(&draw(rows)), 1.0],
+                (Measure::Difference, _) => [target.error(&draw(rows)), 1.0],
             };
             sum = [sum[0] + error, sum[1] + covered];
         }

@@ -10,11 +10,15 @@
 //! Of three photographs or more, parents are removed first that show little of all of them
 //! ([`RefineOptions::least_share`]): they lie behind the surfaces of other photographs, or repeat them.
 //!
-//! A photograph tells little about a scene that was optimised to give it back. The measure of a
-//! refinement is therefore each photograph drawn from the other photographs' Gaussians alone,
-//! where these cover it. Steps end where this error no longer falls, and a set whose error has not
-//! fallen at all stays unchanged. Of two photographs, this picture is also part of the loss ([`RefineOptions::across`]), because two
-//! alone do not tell a wrong depth that gives both of them back.
+//! A photograph tells little about a scene that was optimised to give it back. The measure of two
+//! photographs is therefore each of them drawn from the other's Gaussians alone, where these cover it. This
+//! picture is also part of the loss ([`RefineOptions::across`]), because two alone do not tell a wrong depth
+//! that gives both of them back. Steps end where the error no longer falls, and a set whose error has not
+//! fallen at all stays unchanged.
+//!
+//! Of more photographs each Gaussian moves for all of them, and the measure is the photographs drawn from all
+//! Gaussians. Drawn from the others' alone, five photographs of a clip fell from 25.0 to 23.2 dB in 400 steps
+//! while new views rose from 28.6 to 29.4 dB: Gaussians of the others make way for a photograph's own.
 //!
 //! One step draws one photograph, in an order that depends on their number only. The same input
 //! gives the same bytes on any number of threads, unless [`RefineOptions::time`] limits the steps.
@@ -62,8 +66,8 @@ pub struct RefineOptions {
     /// system). Default: none.
     pub time: Option<Duration>,
     /// The Gaussians are in equal groups, one for each photograph in their order, as
-    /// [`Reconstruction::splats`](crate::Reconstruction::splats) has them. Without groups, the
-    /// measure is the pictures of all Gaussians. Default: false.
+    /// [`Reconstruction::splats`](crate::Reconstruction::splats) has them. Without groups, nothing is removed,
+    /// and the measure of two photographs is the pictures of all Gaussians. Default: false.
     pub grouped: bool,
 }
 
@@ -123,7 +127,7 @@ impl RefineOptions {
 }
 
 /// Result of a refinement: mean squared difference of the photographs, display values. With
-/// [`RefineOptions::grouped`], each is drawn from the other photographs' Gaussians alone.
+/// [`RefineOptions::grouped`], each of two is drawn from the other's Gaussians alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct RefineReport {

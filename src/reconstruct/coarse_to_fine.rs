@@ -30,12 +30,9 @@ use subsplat_kernels::layout::{
     MEAN_OFFSET, OPACITY_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE,
 };
 
-/// Photographs with which each one is compared…
-const SOURCES: usize = 4;
-/// … and with which each of more than [`FEW`]: the time grows with their number.
-const SOURCES_OF_MANY: usize = 2;
-/// See [`SOURCES_OF_MANY`].
-const FEW: usize = 8;
+/// Photographs with which each one is compared. Of five photographs, the scenes that chose the constants of
+/// [`crate::cameras::dense`] have 23.65 dB / .796 with two and 23.59 / .796 with four.
+const SOURCES: usize = 2;
 /// Steps of the optimisation of parents for a step of the refinement of the scene. Twice as many change new
 /// views by 0.00 dB and .002 of SSIM, on the pairs that chose the constants of [`crate::cameras::dense`].
 const STEPS: usize = 2;
@@ -64,8 +61,7 @@ pub fn match_parents(
         .collect();
     let Some(pictures) = pictures else { return Ok(Vec::new()) };
     let cameras: Vec<Camera> = inputs.iter().map(|c| c.input_camera).collect();
-    let count = if inputs.len() > FEW { SOURCES_OF_MANY } else { SOURCES };
-    let sources = choose_sources(&cameras, near_far, count);
+    let sources = choose_sources(&cameras, near_far, SOURCES);
     let mut rows = parents.rows.chunks_exact_mut(SPLAT_STRIDE);
     let depths: Vec<Vec<f32>> = inputs
         .iter()

@@ -6,7 +6,7 @@ use crate::cameras::matches::GrayImage;
 use rayon::prelude::*;
 
 /// Largest difference of a patch that agrees ([`Plane::difference`]).
-const DIFFERENCE_MAX: f32 = 0.4;
+const DIFFERENCE_MAX: f32 = 0.25;
 /// Largest distance of a pixel from its image after the way to another photograph and back, px.
 const RETURN_MAX: f32 = 1.0;
 /// Pixels on either side from which one without a certain depth takes its change.

@@ -12,7 +12,10 @@
 //! affine in the pixel, and so is the projection into another photograph in homogeneous coordinates.
 //!
 //! Constants were chosen on the pairs of `../shared/photos` of the scenes hololens_foosball, re10k_0c9b and
-//! re10k_0f68 (plain and anamorphic) at 128 → 256, by PSNR and SSIM of new views after the refinement.
+//! re10k_0f68 (plain and anamorphic) at 128 → 256, by PSNR and SSIM of new views after the refinement; those
+//! for several sources on five photographs of these scenes (`subsplat-lab eval PHOTOS --contexts 5 --input-size 128
+//! --upscale 2 --methods refine`, 22.94 dB / .778): the mean of the best two sources, hidden or not, was the
+//! cause of most wrong depths.
 //!
 //! Pixels of one colour of a chessboard change together and read the planes of the other colour, and the
 //! random numbers depend on the pixel alone: the same input gives the same result on any number of threads.

@@ -30,6 +30,11 @@ const SAME_PLANE_REACH: f32 = 4.0;
 const CHANGES: [[f32; 2]; 3] = [[0.2, 0.0], [0.01, 0.01], [0.002, 0.003]];
 /// The first changes that halve.
 const HALVING: usize = 2;
+/// Difference from which on a photograph shows something else than the patch, or nothing. A mean with it would
+/// favour wrong planes that two photographs show over right ones that one shows.
+const SECOND_MAX: f32 = 0.8;
+/// Added where one of several photographs shows the patch.
+const UNCONFIRMED: f32 = 0.1;
 /// Fewest pixels of a parallel task.
 const TASK: usize = 256;
 
@@ -40,7 +45,7 @@ pub(super) struct Plane {
     pub inverse: f32,
     /// Its change to the next column and row.
     pub slopes: [f32; 2],
-    /// [`Patch::difference`]: the mean of the best two photographs, or that of the only ones.
+    /// [`Patch::difference`]: the mean of the best two photographs, or that of the one which shows the patch.
     pub difference: f32,
 }
 
@@ -166,8 +171,10 @@ impl Comparison<'_> {
                 best[1] = difference;
             }
         }
-        // Of more photographs one may hide the patch.
-        if self.others.len() > 2 { 0.5 * (best[0] + best[1]) } else { best[0] }
+        if self.others.len() == 1 {
+            return best[0];
+        }
+        if best[1] < SECOND_MAX { 0.5 * (best[0] + best[1]) } else { best[0] + UNCONFIRMED }
     }
 
     /// The best plane of pixel `i` among its own, its neighbours' and changes of it. One loop evaluates all

@@ -57,6 +57,13 @@ fn run(views: &[DenseView<'_>]) -> Vec<DenseMatch> {
     match_depth(views, range, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 
+/// A picture of a place that no other photograph shows.
+fn noise(seed: u64) -> GrayImage {
+    let value =
+        |i: u64| (subsplat_kernels::layout::random::mix(seed + i) >> 40) as f32 / 2f32.powi(24);
+    GrayImage::new(SIZE, SIZE, (0..(SIZE * SIZE) as u64).map(value).collect()).unwrap()
+}
+
 /// Relative error of the depths after the match, sorted, of the pixels that `of` takes.
 fn errors(
     found: &DenseMatch,
@@ -107,14 +114,31 @@ fn the_depth_of_a_tilted_plane_is_found() {
 }
 
 #[test]
+fn sources_that_show_other_places_do_not_disturb() {
+    let [a, b] = cameras();
+    let [(da, pa), (db, pb)] = [&a, &b].map(|camera| seen(camera, NORMAL));
+    let others = [noise(1 << 20), noise(1 << 40)];
+    let first: Vec<f32> = da.iter().map(|z| 1.08 * z).collect();
+    let view = |picture, camera, depth, sources| DenseView { picture, camera, depth, sources };
+    let views = [
+        view(&pa, &a, &first, &[1, 2, 3]),
+        view(&pb, &b, &db, &[0]),
+        view(&others[0], &b, &db, &[0]),
+        view(&others[1], &b, &db, &[0]),
+    ];
+    let found = run(&views);
+    let certain = &found[0].certain;
+    let share = certain.iter().filter(|c| **c).count() as f32 / certain.len() as f32;
+    let errors = errors(&found[0], &first, &da, |i| certain[i]);
+    let at = |share: f32| errors[(share * errors.len() as f32) as usize];
+    assert!(share > 0.6, "{share}");
+    assert!(at(0.5) < 0.004 && at(0.95) < 0.015, "{} {}", at(0.5), at(0.95));
+}
+
+#[test]
 fn pictures_of_other_places_change_nothing() {
     let cameras = cameras();
     let [(a, _), (b, _)] = [0, 1].map(|i| seen(&cameras[i], NORMAL));
-    let noise = |seed: u64| {
-        let value =
-            |i: u64| (subsplat_kernels::layout::random::mix(seed + i) >> 40) as f32 / 2f32.powi(24);
-        GrayImage::new(SIZE, SIZE, (0..(SIZE * SIZE) as u64).map(value).collect()).unwrap()
-    };
     let first = [a, b];
     let found = run(&views(&[noise(1 << 20), noise(1 << 40)], &cameras, &first));
     for one in &found {

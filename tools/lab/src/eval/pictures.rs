@@ -14,10 +14,12 @@ use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::inputs::crop::{Cropped, PhotoWindow};
 use subsplat::reconstruct::stages::{
-    SceneChildren, counts_of, fit_to_inputs, match_parents, options_of_parents,
-    refine_on_inputs, refine_parents,
+    SceneChildren, counts_of, fit_to_inputs, match_parents, options_of_parents, refine_on_inputs,
+    refine_parents,
 };
-use subsplat::reconstruct::{Density, DepthBounds, DepthRange, Error, Reconstructor, Refine, Result};
+use subsplat::reconstruct::{
+    Density, DepthBounds, DepthRange, Error, Reconstructor, Refine, Result,
+};
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{Renderer, render_with};
 use subsplat::scene::splats::Splats;

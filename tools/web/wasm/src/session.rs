@@ -109,6 +109,8 @@ impl Session {
         match request.effort {
             0 => options = options.with_fit(FitOptions::off()).with_refine(Refine::Off),
             1 => options = options.with_refine(Refine::Off),
+            // A page has fewer threads and half of the vector's width: nine steps a photograph.
+            _ if photos.len() > 2 => options = options.with_refine(Refine::Each(3)),
             _ => {}
         }
         let (backend, mut reason) = open(&request.network);
