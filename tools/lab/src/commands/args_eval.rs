@@ -12,7 +12,7 @@ Methods: subsplat (the model), detail (the model with detail from the photograph
 fitted to the photographs), refine (what `run` gives: depth matched, parents refined at the input's \
 size, then their children), unmatched (refine without the match), direct (fit, refined: without both), \
 enlarged and half (what `run` gives for pictures of the input's size, and of half the target's sides, \
-enlarged by Lanczos), pair (detail, on the two inputs nearest to the target alone), backbone (its \
+enlarged by Lanczos), pair (refine, of the two inputs nearest to the target alone), backbone (its \
 backbone's Gaussians alone, rendered at the target's size: spgr=off), lowpass (the same, low-pass \
 scaled to the input), bilinear (the same rendered at the input's size and enlarged), uniform (K equal \
 Gaussians a pixel, untrained), copy (the input nearest to the target), mean (of the inputs).
