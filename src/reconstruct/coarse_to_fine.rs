@@ -36,6 +36,9 @@ const SOURCES: usize = 2;
 /// Steps of the optimisation of parents for a step of the refinement of the scene. Twice as many change new
 /// views by 0.00 dB and .002 of SSIM, on the pairs that chose the constants of [`crate::cameras::dense`].
 const STEPS: usize = 2;
+/// Most steps of parents. Those of many photographs are not reduced to the ones that photographs show, so that
+/// a step takes as long as one of the scene.
+const STEPS_MAX: usize = 160;
 /// Share of a limit of time that the parents take.
 const TIME_SHARE: f32 = 0.25;
 
@@ -100,7 +103,7 @@ pub fn options_of_parents(scene: &RefineOptions, inputs: &[Cropped]) -> Option<R
     let larger = inputs.iter().any(|c| c.target.width > c.input.width);
     let time = scene.time.map(|time| time.mul_f32(TIME_SHARE));
     // Parents are the children's anchors: none is removed before there are children.
-    let steps = scene.steps.saturating_mul(STEPS);
+    let steps = scene.steps.saturating_mul(STEPS).min(STEPS_MAX);
     let options = RefineOptions { steps, time, least_share: 0.0, ..*scene };
     (scene.steps > 0 && larger).then_some(options)
 }

@@ -231,10 +231,14 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
             0 => String::new(),
             n => format!("; {n} splats that hardly show were removed"),
         };
+        let drawn_from = match result.inputs().len() {
+            2 => "the splats of the other one",
+            _ => "all splats",
+        };
         print_line(format!(
             "{steps} steps moved and reshaped the splats to sharpen new views: each photograph, drawn from \
-             the splats of the other photographs, differed by {before:.5} and now by {after:.5} (0: equal; \
-             --refine off leaves this out){removed}"
+             {drawn_from}, differed by {before:.5} and now by {after:.5} (0: equal; --refine off leaves this \
+             out){removed}"
         ));
     }
 }

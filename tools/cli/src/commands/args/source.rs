@@ -104,7 +104,7 @@ pub struct SourceArgs {
     ///
     /// These steps follow those of --fit. Each step draws one photograph from the splats, and changes the
     /// splats towards it. `off`; a number of steps; or a time, such as `20s`. `auto`: eight steps for each of
-    /// two photographs, 24 for each of more, 480 at most. The steps end early where the photographs no longer
+    /// two photographs, 24 for each of more, 240 at most. The steps end early where the photographs no longer
     /// improve.
     #[arg(
         long,
