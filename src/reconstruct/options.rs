@@ -512,7 +512,7 @@ mod tests {
         let steps =
             |refine: Refine, photographs, fitted| refine.options_for(photographs, fitted).steps;
         assert_eq!([2, 5, 20, 50].map(|n| steps(Refine::Auto, n, true)), [16, 120, 240, 240]);
-        assert_eq!([2, 8, 20].map(|n| steps(Refine::Each(4), n, true)), [8, 96, 240]);
+        assert_eq!([2, 8, 20].map(|n| steps(Refine::Each(4), n, true)), [8, 96, 120]);
         assert_eq!([Refine::Auto, Refine::Each(4)].map(|r| steps(r, 2, false)), [0, 0]);
         assert_eq!((steps(Refine::Steps(3), 2, false), steps(Refine::Off, 2, true)), (3, 0));
     }
