@@ -11,6 +11,7 @@
 //!
 //! [`reduce()`] merges Gaussians of a finished scene until their number is as wanted.
 
+mod dropout;
 mod fit;
 pub mod loss;
 pub mod merge;
@@ -36,7 +37,7 @@ pub(crate) use refine::refine_groups;
 #[cfg(feature = "network")]
 pub use removal::Groups;
 #[cfg(feature = "network")]
-pub(crate) use removal::{LEAST_SHARE, hidden, shares};
+pub(crate) use removal::{LEAST_SHARE, families, hidden, restore, shares};
 
 use thiserror::Error;
 

@@ -4,7 +4,9 @@
 //!
 //! The same input gives the same bytes on any number of threads.
 
-use super::parameters::{BLOCK, Before, Buffer, COLOUR, ELEMENTS_MAX, GAIN_STRIDE, OPACITY, Part};
+use super::parameters::{
+    BLOCK, Before, Buffer, COLOUR, ELEMENTS_MAX, GAIN_STRIDE, OPACITY, Part, PartMut,
+};
 use super::phase::{Move, Phase, Photographs, Start};
 use crate::scene::splats::Splats;
 use rayon::prelude::*;
@@ -12,7 +14,8 @@ use std::ops::Range;
 use subsplat_kernels::cpu::adam::SelectiveAdam;
 use subsplat_kernels::cpu::simd::vectorize;
 use subsplat_kernels::layout::{
-    Geometry, Gradients, OPACITY_OFFSET, SCALE_OFFSET, SPLAT_STRIDE, SplatSlices, gain_with_offsets,
+    Geometry, Gradients, OPACITY_OFFSET, SCALE_OFFSET, SPLAT_STRIDE, SplatSlices,
+    gain_with_offsets, sh_coefficients,
 };
 
 /// Decay rates of Adam's moments.
@@ -60,6 +63,8 @@ pub(super) struct Optimiser<'a> {
     rows: Vec<f32>,
     /// `[N, 4]`.
     gain: Vec<f32>,
+    /// `[N, 3·D]`, or empty where the SH coefficients stay.
+    sh: Vec<f32>,
     steps: i32,
 }
 
@@ -98,6 +103,7 @@ impl<'a> Optimiser<'a> {
     ) -> Self {
         let parts = if photographs > 1 { 4 } else { 3 };
         let elements: usize = phase.moves.iter().map(|m| m.parameter.elements()).sum();
+        let moves_sh = phase.moves.iter().any(|m| m.parameter.buffer == Buffer::Sh);
         let mut new = Self {
             before: splats,
             moves: phase.moves.clone(),
@@ -110,6 +116,7 @@ impl<'a> Optimiser<'a> {
             parts,
             rows: splats.rows.clone(),
             gain: gain_with_offsets(&splats.gain, splats.len()),
+            sh: if moves_sh { splats.sh.clone() } else { Vec::new() },
             steps: 0,
         };
         new.begin(phase.starts.first().copied());
@@ -172,7 +179,7 @@ impl<'a> Optimiser<'a> {
     pub fn slices_of<'s>(&'s self, rows: &'s [f32]) -> SplatSlices<'s> {
         SplatSlices {
             geometry: Geometry::Packed(rows),
-            sh: &self.before.sh,
+            sh: if self.sh.is_empty() { &self.before.sh } else { &self.sh },
             gain: &self.gain,
             sh_degree: self.before.sh_degree,
         }
@@ -185,12 +192,21 @@ impl<'a> Optimiser<'a> {
 
     /// The Gaussians as they are now.
     pub fn splats(&self) -> Splats {
-        Splats { rows: self.rows.clone(), gain: self.gain.clone(), ..self.before.clone() }
+        let SplatSlices { sh, sh_degree, .. } = self.slices();
+        let (rows, sh, gain) = (self.rows.clone(), sh.to_vec(), self.gain.clone());
+        Splats { rows, sh, gain, sh_degree, sh_basis: self.before.sh_basis }
     }
 
-    /// Rows and gains of the Gaussians as they are now.
-    pub fn into_parts(self) -> (Vec<f32>, Vec<f32>) {
-        (self.rows, self.gain)
+    /// The Gaussians as they are now.
+    pub fn into_splats(self) -> Splats {
+        let Self { rows, gain, sh, before, .. } = self;
+        let sh = if sh.is_empty() { before.sh.clone() } else { sh };
+        Splats { rows, sh, gain, sh_degree: before.sh_degree, sh_basis: before.sh_basis }
+    }
+
+    /// SH coefficients of a Gaussian, where each has a set.
+    fn sh_stride(&self) -> usize {
+        3 * sh_coefficients(self.before.sh_degree)
     }
 
     /// Adds the gradients of a photograph that is not the last of its step.
@@ -224,8 +240,13 @@ impl<'a> Optimiser<'a> {
         let part = self.elements() * BLOCK;
         let mut states = std::mem::take(&mut self.states);
         let (mut rows, mut gain) = (std::mem::take(&mut self.rows), std::mem::take(&mut self.gain));
-        let numbers =
-            rows.par_chunks_mut(BLOCK * SPLAT_STRIDE).zip(gain.par_chunks_mut(BLOCK * GAIN_STRIDE));
+        let mut sh = std::mem::take(&mut self.sh);
+        let mut sh_of_blocks: Vec<&mut [f32]> = sh.chunks_mut(BLOCK * self.sh_stride()).collect();
+        sh_of_blocks.resize_with(rows.len().div_ceil(BLOCK * SPLAT_STRIDE), Default::default);
+        let numbers = rows
+            .par_chunks_mut(BLOCK * SPLAT_STRIDE)
+            .zip(gain.par_chunks_mut(BLOCK * GAIN_STRIDE))
+            .zip(sh_of_blocks);
         states
             .par_chunks_exact_mut(size)
             .zip(numbers)
@@ -233,7 +254,7 @@ impl<'a> Optimiser<'a> {
             .with_min_len(TASK)
             .for_each_init(
                 || Scratch::new(part / BLOCK),
-                |scratch, (block, (state, (rows, gain)))| {
+                |scratch, (block, (state, ((rows, gain), sh)))| {
                     self.gather(block * BLOCK, rows, photograph, scratch);
                     if let Some(sums) = state.get_mut(3 * part..) {
                         for (g, sum) in scratch.gradient.iter_mut().zip(sums) {
@@ -241,10 +262,11 @@ impl<'a> Optimiser<'a> {
                             *sum = 0.0;
                         }
                     }
-                    self.update(block * BLOCK, &adam, state, scratch, [rows, gain]);
+                    let mut numbers = PartMut { rows, gain, sh };
+                    self.update(block * BLOCK, &adam, state, scratch, &mut numbers);
                 },
             );
-        (self.states, self.rows, self.gain) = (states, rows, gain);
+        (self.states, self.rows, self.gain, self.sh) = (states, rows, gain, sh);
     }
 
     /// Writes the gradients by the parameters of a block of Gaussians, the first of them `first`, to
@@ -262,7 +284,7 @@ impl<'a> Optimiser<'a> {
         let mut at = 0;
         for m in &self.moves {
             let out = &mut scratch.gradient[at * BLOCK..][..m.parameter.elements() * BLOCK];
-            let by = part_of(photograph.all, block.clone());
+            let by = self.part_of(photograph.all, block.clone());
             m.parameter.gradients(rows, by, pixels, out);
             if let (Some(across), Buffer::Rows) = (&photograph.across, m.parameter.buffer) {
                 let Across { gradients, gaussians, weight } = across;
@@ -273,7 +295,8 @@ impl<'a> Optimiser<'a> {
                     let rows = &rows[own.start * SPLAT_STRIDE..own.end * SPLAT_STRIDE];
                     let pixels = pixels.get(own.clone()).unwrap_or_default();
                     let second = &mut scratch.across[..out.len()];
-                    m.parameter.gradients(rows, part_of(gradients, of), pixels, second);
+                    let by = self.part_of(gradients, of);
+                    m.parameter.gradients(rows, by, pixels, second);
                     for (out, second) in out.chunks_exact_mut(BLOCK).zip(second.chunks_exact(BLOCK))
                     {
                         let sums = out[own.clone()].iter_mut().zip(second);
@@ -320,9 +343,9 @@ impl<'a> Optimiser<'a> {
         adam: &SelectiveAdam,
         state: &mut [f32],
         scratch: &mut Scratch,
-        [rows, gain]: [&mut [f32]; 2],
+        numbers: &mut PartMut<'_>,
     ) {
-        let n = rows.len() / SPLAT_STRIDE;
+        let n = numbers.rows.len() / SPLAT_STRIDE;
         let Scratch { gradient, moves, .. } = scratch;
         let moves = &mut moves[..n];
         match self.photographs {
@@ -362,7 +385,7 @@ impl<'a> Optimiser<'a> {
             let values = &values[at * BLOCK..(at + parameter.elements()) * BLOCK];
             vectorize(
                 #[inline(always)]
-                || parameter.write(values, moves, &before, rows, gain),
+                || parameter.write(values, moves, &before, numbers),
             );
             at += parameter.elements();
         }
@@ -375,16 +398,23 @@ impl<'a> Optimiser<'a> {
             GAIN_STRIDE => &self.before.gain[range.start * GAIN_STRIDE..range.end * GAIN_STRIDE],
             _ => &[],
         };
+        let sh_stride = self.sh_stride();
+        let sh = &self.before.sh;
+        let sh = sh.get(range.start * sh_stride..range.end * sh_stride).unwrap_or_default();
         let pixels = self.pixels.get(range).unwrap_or_default();
-        Before { part: Part { rows, gain }, scale: self.scale, pixels }
+        Before { part: Part { rows, gain, sh, sh_stride }, scale: self.scale, pixels }
     }
-}
 
-/// The gradients by the Gaussians `range`.
-fn part_of(gradients: &Gradients, range: Range<usize>) -> Part<'_> {
-    Part {
-        rows: &gradients.rows[range.start * SPLAT_STRIDE..range.end * SPLAT_STRIDE],
-        gain: &gradients.gain[range.start * GAIN_STRIDE..range.end * GAIN_STRIDE],
+    /// The gradients by the Gaussians `range`.
+    fn part_of<'g>(&self, gradients: &'g Gradients, range: Range<usize>) -> Part<'g> {
+        let sh_stride = self.sh_stride();
+        let sh = gradients.sh.get(range.start * sh_stride..range.end * sh_stride);
+        Part {
+            rows: &gradients.rows[range.start * SPLAT_STRIDE..range.end * SPLAT_STRIDE],
+            gain: &gradients.gain[range.start * GAIN_STRIDE..range.end * GAIN_STRIDE],
+            sh: sh.unwrap_or_default(),
+            sh_stride,
+        }
     }
 }
 
@@ -504,7 +534,7 @@ mod tests {
         let splats = gaussians();
         let pixels: Vec<f32> = (0..COUNT).map(|i| 0.01 + 1e-4 * i as f32).collect();
         let spared: Vec<bool> = (0..COUNT).map(|i| i % 5 == 1).collect();
-        let phase = Phase::refine(&RefineOptions::default());
+        let phase = Phase::refine(&RefineOptions::default()).of(&splats, 2);
         let mut all = Optimiser::new(&splats, &phase, 1, pixels.clone(), spared.clone());
         let alpha = |i: usize| row_of(&splats.rows, i)[OPACITY_OFFSET].clamp(1e-3, 1.0 - 1e-3);
         let alone = |i| Alone::new(row_of(&splats.rows, i), gain_of(&splats.gain, i), alpha(i));
@@ -550,6 +580,46 @@ mod tests {
                 assert_eq!(gain_of(&all.gain, i), alone.gain, "step {step}, Gaussian {i}");
             }
         }
+    }
+
+    #[test]
+    fn colours_by_direction_move_for_three_photographs() {
+        let four = gaussians();
+        let sh: Vec<f32> = (0..12 * COUNT).map(|i| 0.01 * (i % 50) as f32).collect();
+        let splats = Splats::new(four.rows, sh.clone(), four.gain, 1, ShBasis::Standard).unwrap();
+        let phase = Phase::refine(&RefineOptions::default());
+        let mut by = gradients(COUNT, 3);
+        let mut noise = noise(4);
+        by.sh = (0..12 * COUNT).map(|i| if i / 12 % 7 == 3 { 0.0 } else { noise() }).collect();
+        let step = |photographs| {
+            let phase = phase.of(&splats, photographs);
+            let pixels = vec![0.01; COUNT];
+            let mut all = Optimiser::new(&splats, &phase, 1, pixels, Vec::new());
+            all.step(&PhotographGradients { all: &by, across: None }, 0.5);
+            let drawn = all.slices().sh.to_vec();
+            assert_eq!(all.splats().sh, drawn);
+            (drawn, all.into_splats().sh)
+        };
+        let [(two, kept), (drawn, three)] = [2, 3].map(step);
+        assert!(two == sh && kept == sh && drawn == three);
+        let rate = 0.5 * RefineOptions::default().sh_rate;
+        for (i, (after, before)) in three.iter().zip(&sh).enumerate() {
+            let (gaussian, coefficient) = (i / 12, i % 12 / 3);
+            let moves = coefficient > 0 && gaussian != 20 && by.sh[i] != 0.0;
+            // Adam's first step is the rate, against the gradient's sign.
+            let expected = if moves { before - rate * by.sh[i].signum() } else { *before };
+            assert!((after - expected).abs() < 1e-6, "{i}: {after} {expected}");
+        }
+        // Gaussians that share a set keep it.
+        let shared = Splats::new(
+            splats.rows[..11 * 4].to_vec(),
+            sh[..24].to_vec(),
+            vec![],
+            1,
+            ShBasis::Standard,
+        );
+        let moves = phase.of(&shared.unwrap(), 3).moves;
+        assert!(moves.iter().all(|m| m.parameter.buffer != Buffer::Sh) && moves.len() == 5);
     }
 
     #[test]
@@ -605,7 +675,7 @@ mod tests {
     fn a_phase_moves_each_number_once() {
         let fit = Phase::fit(&FitOptions::default(), false);
         let refine = Phase::refine(&RefineOptions::default());
-        for (phase, numbers) in [(fit, 7), (refine, 14)] {
+        for (phase, numbers) in [(fit, 7), (refine, 23)] {
             let mut moved = Vec::new();
             for m in &phase.moves {
                 let count = match m.parameter.form {

@@ -25,6 +25,8 @@ pub(super) enum Buffer {
     Rows,
     /// γ and δ, `[N, 4]`.
     Gain,
+    /// SH coefficients, `[N, 3·D]`, of Gaussians with a set each.
+    Sh,
 }
 
 /// Formula by which an element v of a parameter changes a number of a Gaussian. The elements begin at 0, a logit at
@@ -59,7 +61,7 @@ pub(super) struct Parameter {
 /// The table of parameters. A phase moves one of [`SIZE`] and [`SCALES`], which change the same numbers.
 #[rustfmt::skip]
 mod table {
-    use super::Buffer::{Gain, Rows};
+    use super::Buffer::{Gain, Rows, Sh};
     use super::Form::{CommonFactor, Direction, Factor, Logit, Offset, PixelOffset};
     use super::{MEAN_OFFSET, OPACITY_OFFSET, Parameter, QUAT_OFFSET, SCALE_OFFSET};
 
@@ -75,6 +77,12 @@ mod table {
     pub const MEAN:     Parameter = Parameter { buffer: Rows, first: MEAN_OFFSET,    form: PixelOffset };
     /// Unit quaternion wxyz.
     pub const ROTATION: Parameter = Parameter { buffer: Rows, first: QUAT_OFFSET,    form: Direction };
+    /// SH coefficients of degree 1 (RGB), one parameter for each of the three functions.
+    pub const SH_1: [Parameter; 3] = [
+        Parameter { buffer: Sh, first: 3, form: Offset },
+        Parameter { buffer: Sh, first: 6, form: Offset },
+        Parameter { buffer: Sh, first: 9, form: Offset },
+    ];
 }
 pub(super) use table::*;
 
@@ -85,6 +93,20 @@ pub(super) struct Part<'a> {
     pub rows: &'a [f32],
     /// `[n, 4]`, or empty for zeros.
     pub gain: &'a [f32],
+    /// `[n, sh_stride]`, or empty where the SH coefficients stay.
+    pub sh: &'a [f32],
+    /// SH coefficients of a Gaussian, 3·D.
+    pub sh_stride: usize,
+}
+
+/// Numbers of some consecutive Gaussians, to write.
+pub(super) struct PartMut<'a> {
+    /// `[n, 11]`.
+    pub rows: &'a mut [f32],
+    /// `[n, 4]`.
+    pub gain: &'a mut [f32],
+    /// `[n, sh_stride]`, or empty where the SH coefficients stay.
+    pub sh: &'a mut [f32],
 }
 
 impl Parameter {
@@ -104,6 +126,7 @@ impl Parameter {
         let (by, stride) = match self.buffer {
             Buffer::Rows => (by.rows, SPLAT_STRIDE),
             Buffer::Gain => (by.gain, GAIN_STRIDE),
+            Buffer::Sh => (by.sh, by.sh_stride),
         };
         for (e, out) in out.chunks_exact_mut(BLOCK).enumerate() {
             let at = self.first + e;
@@ -127,19 +150,13 @@ impl Parameter {
     }
 
     /// Writes the numbers that this parameter changes, of the Gaussians that move (`moves`, `[n]`).
-    /// `values` `[elements][BLOCK]`; `rows` `[n, 11]` and `gain` `[n, 4]` receive the numbers.
+    /// `values` `[elements][BLOCK]`; `to` receives the numbers.
     #[inline(always)]
-    pub fn write(
-        &self,
-        values: &[f32],
-        moves: &[bool],
-        before: &Before<'_>,
-        rows: &mut [f32],
-        gain: &mut [f32],
-    ) {
+    pub fn write(&self, values: &[f32], moves: &[bool], before: &Before<'_>, to: &mut PartMut<'_>) {
         let (to, from, stride) = match self.buffer {
-            Buffer::Rows => (rows, before.part.rows, SPLAT_STRIDE),
-            Buffer::Gain => (gain, before.part.gain, GAIN_STRIDE),
+            Buffer::Rows => (&mut *to.rows, before.part.rows, SPLAT_STRIDE),
+            Buffer::Gain => (&mut *to.gain, before.part.gain, GAIN_STRIDE),
+            Buffer::Sh => (&mut *to.sh, before.part.sh, before.part.sh_stride),
         };
         // Gaussians without offsets of their own have offsets of 0.
         let from = if from.is_empty() { &ZEROS[..to.len()] } else { from };

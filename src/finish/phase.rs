@@ -11,8 +11,9 @@
 //! A new phase is another value of [`Phase`]. A new course of the rates is a variant of [`Schedule`].
 
 use super::fit::FitOptions;
-use super::parameters::{COLOUR, MEAN, OPACITY, Parameter, ROTATION, SCALES, SIZE};
+use super::parameters::{Buffer, COLOUR, MEAN, OPACITY, Parameter, ROTATION, SCALES, SH_1, SIZE};
 use super::refine::RefineOptions;
+use crate::scene::splats::Splats;
 use std::time::Duration;
 
 /// Opacities of a fit are moved into [this, 1 − this], where the logit is finite.
@@ -31,6 +32,9 @@ const LEAST_GAIN: f64 = 1e-3;
 /// what improves there tells nothing about the rest. Chosen on pairs of `../shared/photos`: the ends of
 /// three sequences, with shares of 0.02, 0.14 and 0.24, change by −0.16, +0.04 and −0.28 dB otherwise.
 const LEAST_COVERED: f64 = 0.25;
+
+/// Fewest photographs that move SH coefficients: fewer show a surface from too few sides.
+const PHOTOGRAPHS_OF_SH: usize = 3;
 
 /// The Gaussians as predicted.
 const PREDICTED: Start = Start { scale: 1.0, density: 1.0 };
@@ -159,6 +163,11 @@ pub(super) struct Phase {
     pub least_covered: f64,
     /// Parents with a smaller share of three photographs or more are removed first.
     pub least_share: f32,
+    /// SH coefficients stay where there are fewer photographs, or where Gaussians share a set.
+    pub photographs_of_sh: usize,
+    /// Share of the Gaussians that a step leaves out, times the number of photographs
+    /// ([`super::dropout::share`]).
+    pub dropout: f32,
 }
 
 impl Phase {
@@ -183,6 +192,8 @@ impl Phase {
             spares_edges: false,
             least_covered: 0.0,
             least_share: 0.0,
+            photographs_of_sh: 0,
+            dropout: 0.0,
         }
     }
 
@@ -195,6 +206,9 @@ impl Phase {
                 Move::free(COLOUR, options.colour_rate),
                 Move::free(MEAN, options.mean_rate),
                 Move::free(ROTATION, options.rotation_rate),
+                Move::free(SH_1[0], options.sh_rate),
+                Move::free(SH_1[1], options.sh_rate),
+                Move::free(SH_1[2], options.sh_rate),
             ],
             opacity_margin: REFINE_OPACITY_MARGIN,
             starts: &[],
@@ -208,7 +222,20 @@ impl Phase {
             spares_edges: true,
             least_covered: LEAST_COVERED,
             least_share: options.least_share,
+            photographs_of_sh: PHOTOGRAPHS_OF_SH,
+            dropout: options.dropout,
         }
+    }
+
+    /// The phase without parameters that `splats` do not have, or that a number of photographs does not move.
+    pub fn of(&self, splats: &Splats, photographs: usize) -> Self {
+        let mut phase = self.clone();
+        let own_sets = splats.sh_degree > 0 && splats.children_per_parent() == 1;
+        if !own_sets || photographs < self.photographs_of_sh {
+            phase.moves.retain(|m| m.parameter.buffer != Buffer::Sh);
+        }
+        phase.moves.retain(|m| m.rate > 0.0);
+        phase
     }
 
     /// Returns whether `parameter` moves.

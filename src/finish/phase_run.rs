@@ -2,6 +2,7 @@
 //! is kept.
 
 use super::FinishError;
+use super::dropout::{self, Dropout};
 use super::optimiser::{Across, Optimiser, PhotographGradients};
 use super::parameters::MEAN;
 use super::phase::{Measure, Phase, Photographs};
@@ -31,6 +32,8 @@ pub struct PhaseRun<'a> {
     gradients: Gradients,
     /// Gradients by the Gaussians of a photograph that the step does not draw, drawn alone.
     across: Gradients,
+    /// Rows of the Gaussians that a step draws, where it leaves some out.
+    drawn: Vec<f32>,
     step: usize,
 }
 
@@ -88,15 +91,17 @@ impl<'a> PhaseRun<'a> {
             Photographs::All => views.len(),
             Photographs::InTurn => 1,
         };
+        let phase = phase.of(splats, views.len());
         Ok(Self {
-            phase: phase.clone(),
             targets,
             raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
             groups,
             begun: None,
-            optimiser: Optimiser::new(splats, phase, photographs, pixels, spared),
+            optimiser: Optimiser::new(splats, &phase, photographs, pixels, spared),
+            phase,
             gradients: Gradients::default(),
             across: Gradients::default(),
+            drawn: Vec::new(),
             step: 0,
         })
     }
@@ -144,17 +149,27 @@ impl<'a> PhaseRun<'a> {
     /// two photographs, where these are drawn alone as well.
     fn add_gradients(&mut self, view: usize, renderer: &mut Renderer) -> Range<usize> {
         let target = &self.targets[view];
-        let slices = self.optimiser.slices();
+        let rows = self.optimiser.rows();
+        let share = dropout::share(self.phase.dropout, self.targets.len());
+        let dropout = (share > 0.0).then(|| Dropout::new(share, self.step));
+        if let Some(dropout) = &dropout {
+            dropout.draw(rows, &mut self.drawn);
+        }
+        let rows = if dropout.is_some() { &self.drawn } else { rows };
+        let slices = self.optimiser.slices_of(rows);
         let (camera, raster) = (target.camera, &self.raster);
         renderer.gradients_of(&slices, camera, raster, &mut self.gradients, &mut |planes| {
             by_planes(target.loss(planes), planes)
         });
+        if let Some(dropout) = &dropout {
+            dropout.chain(self.optimiser.rows(), &mut self.gradients.rows);
+        }
         if !(self.phase.loss.across > 0.0) || self.targets.len() != 2 {
             return 0..0;
         }
         let other = self.group(1 - view).unwrap_or(0..0);
         if !other.is_empty() {
-            let slices = part_of(slices, &other);
+            let slices = part_of(self.optimiser.slices(), &other);
             renderer.gradients_of(&slices, camera, raster, &mut self.across, &mut |planes| {
                 by_planes(target.loss_where_covered(planes), planes)
             });
@@ -300,13 +315,12 @@ pub(super) fn run(
     if !(after < before) {
         return Ok(Outcome::unchanged(steps, before));
     }
-    let (rows, gain) = phase_run.optimiser.into_parts();
-    let removed = splats.len() - rows.len() / SPLAT_STRIDE;
-    if let Some((kept, kept_groups)) = pruned {
-        (*splats, *groups) = (kept, kept_groups);
+    let optimised = phase_run.optimiser.into_splats();
+    let removed = splats.len() - optimised.len();
+    if let Some((_, kept_groups)) = pruned {
+        *groups = kept_groups;
     }
-    splats.rows = rows;
-    splats.gain = gain;
+    *splats = optimised;
     Ok(Outcome { steps, before, after, removed })
 }
 

@@ -11,6 +11,9 @@
 //! on four scenes of real photographs that did not choose the rule, PSNR over all frames is 18.6 dB (40 to 60 %:
 //! 17.7), and over frames between the two photographs 23.2 dB (18.0).
 //!
+//! A scene is made from its best pair and from the photographs that overlap with those chosen before
+//! (`choose_photographs`), up to a number.
+//!
 //! Of many photographs, each is compared with its two best partners (`choose_sources`), not with all: the time
 //! grows with twice the number of photographs, and wide pairs harm.
 
@@ -105,50 +108,127 @@ const ROTATION_DEG: f32 = 20.0;
 /// Smallest parallax: baseline over depth. The backbones were trained at 0.05 to 0.38, and the
 /// measured pairs below 0.1 lose up to 2 dB over their scene.
 const PARALLAX: f32 = 0.1;
+/// Overlap of a further photograph with one that was chosen before. Less leaves places that one photograph
+/// alone shows.
+const LINK_OVERLAP: f32 = 0.7;
+/// Least overlap of a further photograph. One that shows another place does not join.
+const LEAST_OVERLAP: f32 = 0.3;
 /// Largest number of frames whose pairs are all compared. More frames are subsampled evenly.
 const FRAMES_MAX: usize = 128;
+
+/// Frames that can be chosen, and how much of each the others see.
+struct Candidates<'a> {
+    scene: &'a Scene,
+    /// Indices of the frames.
+    frames: Vec<usize>,
+    /// Row t: share of candidate t's picture that each candidate sees, 0 to 1.
+    seen: Vec<Vec<f32>>,
+    /// Distance of what the photographs show, world units, with its source.
+    depth: f32,
+    origin: &'static str,
+}
+
+impl<'a> Candidates<'a> {
+    /// The usable frames of `scene`, [`FRAMES_MAX`] at most. Returns `None` where no distance is known.
+    fn new(scene: &'a Scene) -> Option<Self> {
+        let step = scene.frames.len().div_ceil(FRAMES_MAX).max(1);
+        let frames: Vec<usize> = scene.usable().into_iter().step_by(step).collect();
+        let (depth, origin) = typical_depth(scene)?;
+        let [low, high] = depths_around(depth);
+        let camera = |n: usize| &scene.frames[frames[n]].camera;
+        let seen = (0..frames.len())
+            .into_par_iter()
+            .map(|t| {
+                let share = |n: usize| overlap_in(camera(t), camera(n), low, high);
+                (0..frames.len()).map(|n| if n == t { 1.0 } else { share(n) }).collect()
+            })
+            .collect();
+        Some(Self { scene, frames, seen, depth, origin })
+    }
+
+    fn camera(&self, n: usize) -> &Camera {
+        &self.scene.frames[self.frames[n]].camera
+    }
+
+    /// Mean share of both pictures that the other one shows.
+    fn overlap(&self, a: usize, b: usize) -> f32 {
+        0.5 * (self.seen[a][b] + self.seen[b][a])
+    }
+
+    /// The best pair as candidates, and its geometry.
+    fn best_pair(&self) -> Option<([usize; 2], ViewGeometry)> {
+        let count = self.frames.len();
+        let coverage = |a: usize, b: usize| {
+            self.seen.iter().map(|row| row[a].max(row[b])).sum::<f32>() / count as f32
+        };
+        let pairs: Vec<(usize, usize)> =
+            (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b))).collect();
+        let scored: Vec<(f32, [usize; 2], ViewGeometry)> = pairs
+            .into_par_iter()
+            .filter_map(|(a, b)| {
+                let geometry = geometry(self.camera(a), self.camera(b), self.overlap(a, b));
+                Some((score(&geometry, self.depth, coverage(a, b))?, [a, b], geometry))
+            })
+            .collect();
+        // The first of equal scores, so that the result does not depend on the threads.
+        let best = scored.into_iter().reduce(|a, b| if b.0 > a.0 { b } else { a });
+        best.map(|(_, pair, geometry)| (pair, geometry))
+    }
+}
+
+/// Range of distances around a typical one.
+fn depths_around(depth: f32) -> [f32; 2] {
+    [0.5 * depth, 2.0 * depth]
+}
 
 /// Selects the pair of frames with an overlap nearest to 85 %, a baseline and little rotation
 /// (weights: see `score`).
 ///
 /// Returns `None` if the scene has no two frames at different positions.
 pub fn choose_pair(scene: &Scene) -> Option<Pair> {
-    let step = scene.frames.len().div_ceil(FRAMES_MAX).max(1);
-    let candidates: Vec<usize> = scene.usable().into_iter().step_by(step).collect();
-    let (depth, origin) = typical_depth(scene)?;
-    let depths = [0.5 * depth, 2.0 * depth];
-    let camera = |n: usize| &scene.frames[candidates[n]].camera;
-    let count = candidates.len();
-    // Row t: share of candidate t's picture that each candidate sees.
-    let seen: Vec<Vec<f32>> = (0..count)
-        .into_par_iter()
-        .map(|t| {
-            let share = |n: usize| overlap_in(camera(t), camera(n), depths[0], depths[1]);
-            (0..count).map(|n| if n == t { 1.0 } else { share(n) }).collect()
-        })
-        .collect();
-    let coverage =
-        |a: usize, b: usize| seen.iter().map(|row| row[a].max(row[b])).sum::<f32>() / count as f32;
-    let pairs: Vec<(usize, usize)> =
-        (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b))).collect();
-    let scored: Vec<(f32, Pair)> = pairs
-        .into_par_iter()
-        .filter_map(|(a, b)| {
-            let geometry = geometry(camera(a), camera(b), 0.5 * (seen[a][b] + seen[b][a]));
-            let score = score(&geometry, depth, coverage(a, b))?;
-            let (i, j) = (candidates[a], candidates[b]);
-            let reason = format!(
-                "about {:.0} % overlap, where 85 % gives the best views; turned by {:.1} degrees and \
-                 {:.3} apart, with the scene at about {depth:.3}: {origin}",
-                100.0 * geometry.overlap,
-                geometry.rotation_deg,
-                geometry.baseline,
-            );
-            Some((score, Pair { frames: [i, j], geometry, depths, reason }))
-        })
-        .collect();
-    // The first of equal scores, so that the result does not depend on the threads.
-    scored.into_iter().reduce(|a, b| if b.0 > a.0 { b } else { a }).map(|(_, pair)| pair)
+    let candidates = Candidates::new(scene)?;
+    let ([a, b], geometry) = candidates.best_pair()?;
+    let Candidates { frames, depth, origin, .. } = candidates;
+    let reason = format!(
+        "about {:.0} % overlap, where 85 % gives the best views; turned by {:.1} degrees and \
+         {:.3} apart, with the scene at about {depth:.3}: {origin}",
+        100.0 * geometry.overlap,
+        geometry.rotation_deg,
+        geometry.baseline,
+    );
+    Some(Pair { frames: [frames[a], frames[b]], geometry, depths: depths_around(depth), reason })
+}
+
+/// Selects the frames of a scene that is made from `most` photographs at most, 2 or more: the best pair
+/// ([`choose_pair`]), then again and again the frame that overlaps least with those chosen before, but by
+/// [`LINK_OVERLAP`]; where none does, the one that overlaps most. Frames that overlap with none by
+/// [`LEAST_OVERLAP`] are left out. In ascending order.
+///
+/// Returns `None` if the scene has no two frames at different positions.
+pub fn choose_photographs(scene: &Scene, most: usize) -> Option<Vec<usize>> {
+    let candidates = Candidates::new(scene)?;
+    let (pair, _) = candidates.best_pair()?;
+    let mut chosen = pair.to_vec();
+    let link = |t: usize, chosen: &[usize]| {
+        chosen.iter().map(|&c| candidates.overlap(t, c)).fold(0.0f32, f32::max)
+    };
+    while chosen.len() < most {
+        let rest = (0..candidates.frames.len()).filter(|t| !chosen.contains(t));
+        let links: Vec<(usize, f32)> = rest
+            .map(|t| (t, link(t, &chosen)))
+            .filter(|(_, link)| *link >= LEAST_OVERLAP)
+            .collect();
+        let linked = links.iter().filter(|(_, link)| *link >= LINK_OVERLAP);
+        // The first of equal overlaps.
+        let next = linked
+            .reduce(|a, b| if b.1 < a.1 { b } else { a })
+            .or_else(|| links.iter().reduce(|a, b| if b.1 > a.1 { b } else { a }));
+        let Some((next, _)) = next else { break };
+        chosen.push(*next);
+    }
+    let mut frames: Vec<usize> = chosen.into_iter().map(|n| candidates.frames[n]).collect();
+    frames.sort_unstable();
+    Some(frames)
 }
 
 /// Returns the score of a pair, or `None` without a baseline. A higher score is better. `coverage`:
@@ -338,6 +418,31 @@ mod tests {
         assert_eq!(choose_sources(&others, depths, 1)[0], [3]);
         // Fewer cameras than sources.
         assert_eq!(choose_sources(&row[..2], depths, 2), [[1], [0]]);
+    }
+
+    #[test]
+    fn a_scene_of_many_photographs_is_covered_by_linked_ones() {
+        // Sideways in steps of 0.1 at a depth of 3, 0.5 % of overlap each; then cameras elsewhere.
+        let mut walk: Vec<Camera> =
+            (0..40u8).map(|i| camera(0.0, Vec3::X * 0.1 * f32::from(i))).collect();
+        walk.extend((0..5u8).map(|i| camera(3.0, Vec3::X * 0.1 * f32::from(i))));
+        let mut walk = scene(walk);
+        walk.units = Units::RealEstate10k;
+        let frames = choose_photographs(&walk, 6).unwrap();
+        assert_eq!(frames.len(), 6);
+        let overlap = |a: usize, b: usize| {
+            let [a, b] = [a, b].map(|i| &walk.frames[i].camera);
+            view_geometry(a, b, 1.5, 6.0).overlap
+        };
+        let neighbours: Vec<f32> = frames.windows(2).map(|w| overlap(w[0], w[1])).collect();
+        assert!(neighbours.iter().all(|o| *o >= LINK_OVERLAP), "{neighbours:?}");
+        // They reach as far as the links allow.
+        assert!(overlap(frames[0], frames[5]) < 0.4, "{frames:?}");
+        // All of one place, none of the other.
+        let all = choose_photographs(&walk, 100).unwrap();
+        assert_eq!(all, (0..40).collect::<Vec<_>>());
+        let pair = choose_pair(&walk).unwrap();
+        assert_eq!(choose_photographs(&walk, 2).unwrap(), pair.frames);
     }
 
     #[test]

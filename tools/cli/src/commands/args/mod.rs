@@ -73,8 +73,8 @@ pub struct Cli {
 pub enum Command {
     /// Make a 3D scene from photographs, and draw new views of it.
     ///
-    /// Two photographs of one place, taken a step apart, are enough. Up to five are all used. Of more,
-    /// the two that overlap best are used; --context names others. The output folder gets the scene (scene.ply), the views (images/,
+    /// Two photographs of one place, taken a step apart, are enough. Up to twelve are all used. Of more,
+    /// twelve that overlap are used; --context names others. The output folder gets the scene (scene.ply), the views (images/,
     /// depth/), their cameras (cameras.json) and metrics.json.
     Run(Box<RunArgs>),
     /// Draw pictures or an animation of a finished scene.

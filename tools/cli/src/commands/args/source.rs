@@ -12,8 +12,8 @@ use subsplat::{Density, InputSize, Quality, Refine, TargetSize};
 pub struct SourceArgs {
     /// Photographs to make the scene from: names or numbers.
     ///
-    /// Names are those of the files; numbers count from 0. Default: up to five photographs without cameras are all taken. Of more, and of a scene with
-    /// cameras, those that its protocol.json names, else the two whose views overlap best.
+    /// Names are those of the files; numbers count from 0. Default: those that protocol.json names, else all photographs
+    /// up to twelve, of more twelve that overlap.
     #[arg(long, value_delimiter = ',', value_name = "I,J,…", help_heading = CAMERAS)]
     pub context: Vec<String>,
     /// Cameras of photographs without a pose file.
