@@ -333,14 +333,14 @@ impl TargetSize {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refine {
-    /// [`Refine::Each`] of 8: 16 steps for two photographs, 24 a photograph for more, 240 at most. A refinement
-    /// of two photographs takes 322 bytes a Gaussian.
+    /// [`Refine::Each`] of 8: 16 steps for two photographs, 40 for three, 75 for four, 24 a photograph for more, 240 at
+    /// most. A refinement of two photographs takes 322 bytes a Gaussian.
     #[default]
     Auto,
     /// None.
     Off,
-    /// This number of steps for each of two photographs, three times as many for each of more, and at most
-    /// those of ten; none where [`Options::fit`] is off.
+    /// This number of steps for each of two photographs, three times as many for each of five or more, in between
+    /// for three and four, and at most those of ten; none where [`Options::fit`] is off.
     Each(usize),
     /// At most this number of steps.
     Steps(usize),
@@ -352,21 +352,27 @@ pub enum Refine {
 /// [`Refine::Each`] of [`Refine::Auto`].
 const AUTO_STEPS: usize = 8;
 
-/// Factor of the steps of more than two photographs. Each of them is compared with Gaussians of several
-/// photographs, whose geometry more steps bring together: new views of five photographs at 128 → 256 have 23.65
-/// dB after 40 steps, 23.91 after 120 and 23.89 after 240 (the scenes that chose the constants of
-/// [`crate::cameras::dense`]); of the pairs of these scenes 18.79 dB after 16 steps and 18.80 after 40.
-const MORE_THAN_TWO: usize = 3;
+/// Largest factor of the steps of more than two photographs. Each of them is compared with Gaussians of several
+/// photographs, whose geometry more steps bring together: new views of five photographs at 128 → 256 have 23.56
+/// dB after 40 steps, 23.83 after 80 and 23.93 after 120 (the scenes that chose the constants of
+/// [`crate::cameras::dense`]); of three 18.09, 18.17 and 18.22 dB after 24, 48 and 72; of the pairs of these scenes
+/// 18.79 dB after 16 steps and 18.80 after 40.
+const FACTOR_MAX: usize = 3;
+
+/// Photographs from which on the factor is [`FACTOR_MAX`].
+const PHOTOGRAPHS_OF_MAX: usize = 5;
 
 /// Photographs whose steps [`Refine::Auto`] and [`Refine::Each`] allow in all. Seventeen photographs of
 /// `../shared/photos/fox`, 256 → 512, three others as targets (`run --refine N`): 28.07 dB / .865 after 64 steps,
 /// 29.29 / .872 after 204, 29.43 / .867 after 408; the last ones take 100 s on two cores of an EPYC.
 const PHOTOGRAPHS_MAX: usize = 10;
 
-/// Steps of `each` and a number of photographs.
+/// Steps of `each` and a number of photographs. The factor rises evenly from 1 of two photographs.
 fn steps_of(each: usize, photographs: usize) -> usize {
-    let factor = if photographs > 2 { MORE_THAN_TWO } else { 1 };
-    each.saturating_mul(factor * photographs.min(PHOTOGRAPHS_MAX))
+    let further = photographs.clamp(2, PHOTOGRAPHS_OF_MAX) - 2;
+    let thirds = (PHOTOGRAPHS_OF_MAX - 2) + (FACTOR_MAX - 1) * further;
+    let steps = each.saturating_mul(thirds * photographs.min(PHOTOGRAPHS_MAX));
+    steps.div_ceil(PHOTOGRAPHS_OF_MAX - 2)
 }
 
 impl Refine {
@@ -511,7 +517,9 @@ mod tests {
     fn steps_of_a_refinement() {
         let steps =
             |refine: Refine, photographs, fitted| refine.options_for(photographs, fitted).steps;
-        assert_eq!([2, 5, 20, 50].map(|n| steps(Refine::Auto, n, true)), [16, 120, 240, 240]);
+        let counts = [1, 2, 3, 4, 5, 10, 20, 50];
+        let expected = [8, 16, 40, 75, 120, 240, 240, 240];
+        assert_eq!(counts.map(|n| steps(Refine::Auto, n, true)), expected);
         assert_eq!([2, 8, 20].map(|n| steps(Refine::Each(4), n, true)), [8, 96, 120]);
         assert_eq!([Refine::Auto, Refine::Each(4)].map(|r| steps(r, 2, false)), [0, 0]);
         assert_eq!((steps(Refine::Steps(3), 2, false), steps(Refine::Off, 2, true)), (3, 0));

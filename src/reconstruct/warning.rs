@@ -121,6 +121,27 @@ impl fmt::Display for Warning {
 }
 
 impl Warning {
+    /// The warnings as sentences for a person: each sentence once, and one for the corrections of exposure of
+    /// three photographs or more.
+    pub fn sentences(warnings: &[Self]) -> Vec<String> {
+        let exposure = |w: &&Self| matches!(w, Self::ExposureCorrected { .. });
+        let corrected = warnings.iter().filter(exposure).count();
+        let mut sentences: Vec<String> = Vec::new();
+        for warning in warnings {
+            let sentence = match warning {
+                Self::ExposureCorrected { reference, .. } if corrected > 2 => format!(
+                    "brightness and colours of {corrected} photographs are matched to those of \
+                     photograph {reference} (counted from 0)"
+                ),
+                _ => warning.to_string(),
+            };
+            if !sentences.contains(&sentence) {
+                sentences.push(sentence);
+            }
+        }
+        sentences
+    }
+
     /// All findings of the checked pairs.
     pub(super) fn of_reports(reports: &[PairReport]) -> Vec<Self> {
         let pair = |(first, report): (usize, &PairReport)| {
@@ -165,5 +186,28 @@ impl Warning {
     pub(super) fn of_bounds(bounds: &DepthBounds) -> Option<Self> {
         let DepthBounds { near, far, source } = bounds;
         source.is_guess().then_some(Self::DepthRangeGuessed { near: *near, far: *far })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_corrections_of_exposure_are_one_sentence() {
+        let exposure = |photo| Warning::ExposureCorrected {
+            photo,
+            reference: 9,
+            gain: [1.0; 3],
+            offset: [photo as f32; 3],
+        };
+        let range = Warning::DepthRangeGuessed { near: 1.0, far: 2.0 };
+        let two = Warning::sentences(&[exposure(0), range.clone(), exposure(1)]);
+        assert_eq!(two.len(), 3);
+        assert!(two[0].contains("photograph 0") && two[2].contains("+1"), "{two:?}");
+        let many = [exposure(0), exposure(1), range.clone(), exposure(2), range];
+        let sentences = Warning::sentences(&many);
+        assert_eq!(sentences.len(), 2, "{sentences:?}");
+        assert!(sentences[0].contains("of 3 photographs") && sentences[0].contains("photograph 9"));
     }
 }

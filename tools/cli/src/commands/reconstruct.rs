@@ -16,7 +16,7 @@ use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, InputSize, Matching, Options, Photo, Poses, Prepared,
-    Quality, Reconstruction, Reconstructor, TargetSize,
+    Quality, Reconstruction, Reconstructor, TargetSize, Warning,
 };
 use subsplat_kernels::camera::Size;
 
@@ -198,7 +198,7 @@ fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {
         }
         None => {}
     }
-    prepared.warnings().iter().for_each(print_warning);
+    Warning::sentences(prepared.warnings()).iter().for_each(print_warning);
     if prepared.reports().iter().any(|r| r.verdict == Verdict::Bad) {
         print_warning(
             "these cameras disagree with the photographs, so the scene will be smeared; `subsplat check` \
@@ -214,7 +214,8 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
     if result.depth_range() != result.initial_depth_range() {
         print_depth_range(result.depth_range());
     }
-    result.warnings().iter().skip(printed).for_each(print_warning);
+    let rest = result.warnings().get(printed..).unwrap_or_default();
+    Warning::sentences(rest).iter().for_each(print_warning);
     if result.detail() == Detail::Photographs {
         print_line("fine texture comes from the full photographs (--detail off leaves it out)");
     }

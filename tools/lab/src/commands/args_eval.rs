@@ -3,7 +3,7 @@
 use crate::eval::{Disturbance, Method};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
-use subsplat::Density;
+use subsplat::{Density, Refine};
 use subsplat_cli::commands::args::{DetailArg, ModelArgs};
 use subsplat_cli::commands::values;
 
@@ -44,6 +44,9 @@ pub struct EvalArgs {
     /// them as targets, instead of the protocol's.
     #[arg(long, value_name = "N", value_parser = values::at_least_one, conflicts_with = "index")]
     pub contexts: Option<usize>,
+    /// With --contexts: every K-th frame is a target, whatever the number of inputs, and none of them an input.
+    #[arg(long, value_name = "K", value_parser = values::at_least_one, requires = "contexts")]
+    pub holdout: Option<usize>,
     /// Folder for eval.json, targets.csv, means.csv, index.html and the pictures
     /// (pictures/METHOD/SCENE/INPUTS/FRAME.png). Default: no files are written.
     #[arg(short, long, value_name = "DIR")]
@@ -61,6 +64,9 @@ pub struct EvalArgs {
     /// Number of Gaussians, as in `run`; `opaque` and `random` remove others of all instead.
     #[arg(long, value_name = "auto | N | P% | K/px", value_parser = values::density, default_value = "auto")]
     pub gaussians: Density,
+    /// Length of the refinement, as in `run`: of refine, enlarged, half and pair.
+    #[arg(long, value_name = "auto | off | N | 20s", value_parser = values::refine, default_value = "auto")]
+    pub refine: Refine,
     /// Score also PNG pictures of another program: DIR/SCENE/INPUTS/NNNNNN.png, or
     /// SCENE/color/NNNNNN.png, SCENE/NNNNNN.png, SCENE/FRAMENAME.png.
     #[arg(long, value_name = "NAME=DIR")]

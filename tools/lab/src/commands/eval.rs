@@ -36,7 +36,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
         let mut data = Benchmark::open(&args.data, args.index.as_deref())?;
         data.set_depth_range(DepthRange::from_ends(args.near, args.far));
         if let Some(count) = args.contexts {
-            data.spread_contexts(count)?;
+            data.spread_contexts(count, args.holdout)?;
         }
         Ok(data)
     })?;
@@ -65,6 +65,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
             equal_exposure: args.equal_exposure,
         },
         density: args.gaussians,
+        refine: args.refine,
         ..Options::new(upscale)
     };
     if let Some(model) = &model {

@@ -213,35 +213,30 @@ impl Benchmark {
     /// Replaces the cases by one for each scene: `count` frames spread over the sequence are its
     /// inputs, and the frames in the middle between two of them its targets. A tenth of the
     /// sequence at either end is left out. Scenes with fewer than 2·`count` − 1 frames in between
-    /// have no case; [`Benchmark::notes`] names them.
+    /// have no case; [`Benchmark::notes`] names them. With `held` = K, every K-th frame is a target instead,
+    /// the same ones for any number of inputs, which are spread over the others.
     ///
     /// # Errors
     /// Chunks instead of scenes; fewer than two inputs; no scene with enough frames.
-    pub fn spread_contexts(&mut self, count: usize) -> Result<()> {
+    pub fn spread_contexts(&mut self, count: usize, held: Option<usize>) -> Result<()> {
         if self.chunks || count < 2 {
             let expected = "at least 2 inputs, and scenes instead of chunks";
             return Err(Error::argument("inputs of each case", expected, count.to_string()));
         }
         let (mut cases, mut short) = (Vec::new(), Vec::new());
         for (i, scene) in self.scenes.iter().enumerate() {
-            let usable = scene.usable();
-            let margin = usable.len() / 10;
-            let between = usable.len() - 2 * margin;
-            if between < 2 * count - 1 {
+            let Some(views) = spread(&scene.usable(), count, held) else {
                 short.push(scene.name.clone());
                 continue;
-            }
-            let at = |n: usize| margin + n * (between - 1) / (count - 1);
-            let context: Vec<usize> = (0..count).map(at).collect();
-            let target = context.windows(2).map(|pair| usable[(pair[0] + pair[1]) / 2]).collect();
-            let context = context.into_iter().map(|n| usable[n]).collect();
+            };
             let resolution = self.cases.iter().find(|c| c.scene == scene.name);
             let resolution = resolution.and_then(|c| c.resolution);
-            let views = Views { context, target };
             cases.push(Case::new(&scene.name, views, resolution, Place::Scene(i)));
         }
         if cases.is_empty() {
-            let expected = format!("a scene with {} frames or more", 2 * count - 1);
+            let frames =
+                held.map_or(2 * count - 1, |every| count + count.div_ceil(every.max(2) - 1));
+            let expected = format!("a scene with {frames} frames or more");
             return Err(Error::argument("scenes", expected, "none"));
         }
         if !short.is_empty() {
@@ -380,6 +375,31 @@ impl Benchmark {
     }
 }
 
+/// `count` inputs spread over the frames `usable` of a scene, and targets: the frames in the middle between two
+/// inputs; with `held` = K every K-th frame, whatever the number of inputs, of which none is a target. `None`
+/// where the frames are too few.
+fn spread(usable: &[usize], count: usize, held: Option<usize>) -> Option<Views> {
+    let Some(every) = held else {
+        let margin = usable.len() / 10;
+        let between = usable.len() - 2 * margin;
+        if between < 2 * count - 1 {
+            return None;
+        }
+        let at = |n: usize| margin + n * (between - 1) / (count - 1);
+        let context: Vec<usize> = (0..count).map(at).collect();
+        let target = context.windows(2).map(|pair| usable[(pair[0] + pair[1]) / 2]).collect();
+        let context = context.into_iter().map(|n| usable[n]).collect();
+        return Some(Views { context, target });
+    };
+    let is_target = |n: &usize| n % every == every / 2;
+    let (target, rest): (Vec<usize>, Vec<usize>) = (0..usable.len()).partition(is_target);
+    if rest.len() < count || target.is_empty() {
+        return None;
+    }
+    let context = (0..count).map(|n| usable[rest[n * (rest.len() - 1) / (count - 1)]]).collect();
+    Some(Views { context, target: target.into_iter().map(|n| usable[n]).collect() })
+}
+
 /// Makes up a scene's views, with the k of "every k-th frame": the pair that `subsplat run` chooses,
 /// and at most [`MADE_UP_TARGETS`] of the frames between the two; of the others where there are none.
 /// `None` for a scene of two frames, and without two frames at different places.
@@ -399,4 +419,26 @@ fn made_up_views(scene: &Scene) -> Option<(Views, usize)> {
 fn photo(chunk: &Chunk, video: &Example, frame: usize) -> Result<Photo> {
     let (image, camera) = chunk.load(video, frame)?;
     Photo::new(image, camera)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn held_frames_are_the_same_for_any_number_of_inputs() {
+        let frames: Vec<usize> = (100..120).collect();
+        let views = |count| spread(&frames, count, Some(8)).unwrap();
+        assert_eq!(views(3).target, [104, 112]);
+        assert_eq!(views(3).context, [100, 109, 119]);
+        for count in 2..=18 {
+            let Views { context, target } = views(count);
+            assert_eq!((context.len(), target), (count, vec![104, 112]));
+            assert!(context.windows(2).all(|w| w[0] < w[1]), "{context:?}");
+            assert!(!context.contains(&104) && !context.contains(&112), "{context:?}");
+        }
+        assert!(spread(&frames, 19, Some(8)).is_none() && spread(&frames, 2, Some(50)).is_none());
+        let between = spread(&frames, 3, None).unwrap();
+        assert_eq!((between.context, between.target), (vec![102, 109, 117], vec![105, 113]));
+    }
 }

@@ -40,6 +40,8 @@ pub struct Options {
     pub preparation: Preparation,
     /// Number of the model's Gaussians.
     pub density: Density,
+    /// Length of the refinement.
+    pub refine: subsplat::Refine,
 }
 
 impl Options {
@@ -71,6 +73,7 @@ impl Options {
             disturbances: Vec::new(),
             preparation: Preparation::default(),
             density: Density::Auto,
+            refine: subsplat::Refine::Auto,
         }
     }
 }

@@ -38,6 +38,7 @@ pub(super) struct PictureMaker<'a> {
     colour: [f32; 3],
     network: Option<Network<'a>>,
     density: Density,
+    refine: Refine,
     /// The set that `splats` holds.
     current: Option<Set>,
     splats: Option<SceneChildren>,
@@ -182,6 +183,7 @@ impl<'a> PictureMaker<'a> {
             colour: Rgb::mean_colour(crops.inputs.iter().map(|c| &c.input)),
             network,
             density: options.density,
+            refine: options.refine,
             current: None,
             splats: None,
             rasterizer: Rasterizer::new(),
@@ -327,7 +329,7 @@ impl<'a> PictureMaker<'a> {
         let mut parents = network.encoding().parents(network.model.model())?;
         let mut part = |_: f32| ControlFlow::Continue(());
         match_parents(&mut parents, inputs, self.bounds.near_far(), &mut part)?;
-        let options = Refine::Auto.options_for(inputs.len(), true);
+        let options = self.refine.options_for(inputs.len(), true);
         let renderer = &mut Renderer::default();
         refine_parents(&mut parents, inputs, &small, &options, renderer, &mut part)?;
         Ok(parents)
@@ -350,7 +352,7 @@ impl<'a> PictureMaker<'a> {
             let near_far = self.bounds.near_far();
             match_parents(&mut own, inputs, near_far, &mut part)?;
         }
-        let options = Refine::Auto.options_for(inputs.len(), true);
+        let options = self.refine.options_for(inputs.len(), true);
         let options =
             options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
         if let Some(options) = options {
@@ -363,7 +365,7 @@ impl<'a> PictureMaker<'a> {
         let mut children = self.refined(network, children, at, &IN_ORDER[1..])?;
         let SceneChildren { splats, groups, .. } = &mut children;
         let raster = self.raster_options(network, ratio, None);
-        let options = Refine::Auto.options_for(inputs.len(), true);
+        let options = self.refine.options_for(inputs.len(), true);
         let mut step = |_: &PhaseRun<'_>| ControlFlow::Continue(());
         let renderer = &mut renderer;
         refine_on_inputs(splats, groups, inputs, &raster, &options, renderer, &mut step)?;

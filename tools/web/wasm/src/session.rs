@@ -109,7 +109,7 @@ impl Session {
         match request.effort {
             0 => options = options.with_fit(FitOptions::off()).with_refine(Refine::Off),
             1 => options = options.with_refine(Refine::Off),
-            // A page has fewer threads and half of the vector's width: nine steps a photograph.
+            // A page has fewer threads and half of the vector's width: nine steps for each of five photographs or more.
             _ if photos.len() > 2 => options = options.with_refine(Refine::Each(3)),
             _ => {}
         }
@@ -122,12 +122,13 @@ impl Session {
                 ControlFlow::Continue(())
             })
             .map_err(|e| e.to_string())?;
-        for warning in result.warnings() {
-            match warning {
-                Warning::CpuInsteadOfGpu { reason: text, .. } => reason = Some(text.clone()),
-                _ => warnings.push(warning.to_string()),
-            }
-        }
+        let (of_gpu, rest): (Vec<Warning>, Vec<Warning>) = result
+            .warnings()
+            .iter()
+            .cloned()
+            .partition(|warning| matches!(warning, Warning::CpuInsteadOfGpu { .. }));
+        reason = of_gpu.last().map(Warning::to_string).or(reason);
+        warnings.extend(Warning::sentences(&rest));
         let processor = if backend.is_cpu() { "cpu" } else { "gpu" };
         self.scene = Some(Scene {
             options: *result.raster_options(),
