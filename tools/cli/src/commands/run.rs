@@ -1,6 +1,6 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
-use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderingArgs, RunArgs};
+use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderingArgs, RunArgs, SourceArgs};
 use super::frames::{self, DepthSpread};
 use super::html::Page;
 use super::output::{self, Scored, View, Views};
@@ -172,7 +172,7 @@ fn backend(device: &str) -> Backend {
 fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
     scene.warnings.iter().for_each(print_warning);
-    let (context, reason) = context(&args.source.context, &args.input[0], &scene)?;
+    let (context, reason) = context(&args.source, &args.input[0], &scene)?;
     print_line(format!(
         "{}: {} photographs ({}); the scene is made from {reason}",
         scene.name,
@@ -201,13 +201,10 @@ pub fn photographs(
     })
 }
 
-/// Most photographs of a scene where none are named. Seventeen of `../shared/photos/fox` take 2.7 minutes at
-/// 256 → 512 on two cores.
-const CONTEXT_MAX: usize = 12;
-
-/// Chooses the context frames of the scene at `input`: those of `named`, or a default. Returns
+/// Chooses the context frames of the scene at `input`: those that `args` name, or a default. Returns
 /// the reason for the choice too.
-pub fn context(named: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
+pub fn context(args: &SourceArgs, input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
+    let (named, most) = (&args.context, args.photographs_max());
     let list = |frames: &[usize]| frames.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
     if !named.is_empty() {
         let chosen = frames::indices(scene, named, "--context")?;
@@ -236,11 +233,11 @@ pub fn context(named: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usi
         return Ok((test.context, text));
     }
     let count = scene.frames.len();
-    if scene.source == SceneFormat::Photographs && count <= CONTEXT_MAX {
+    if scene.source == SceneFormat::Photographs && count <= most {
         let all: Vec<usize> = (0..count).collect();
         return Ok((all, "all of them".to_owned()));
     }
-    let Some(chosen) = choose_photographs(scene, CONTEXT_MAX) else {
+    let Some(chosen) = choose_photographs(scene, most) else {
         bail!(
             "{}: expected two photographs taken from different places, got {} from one place",
             scene.name,
@@ -251,7 +248,7 @@ pub fn context(named: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usi
         "all of them".to_owned()
     } else {
         let from = format!("{} of them ({})", chosen.len(), list(&chosen));
-        if chosen.len() < CONTEXT_MAX {
+        if chosen.len() < most {
             format!("{from}: the others show other places")
         } else {
             format!("{from}, which overlap; --context names others")

@@ -315,6 +315,36 @@ fn two_photographs_without_a_scene() {
 }
 
 #[test]
+fn twelve_photographs_are_used_without_being_named() {
+    let place = workplace();
+    let quick = "--json run scene --input-size 32 --fit 0 --refine off --no-check -o";
+    let called = call_in(place.path(), &format!("{quick} three"));
+    assert_eq!(done(&called)["context"], serde_json::json!(["view0", "view1", "view2"]));
+    assert!(called.stderr.contains("all of them"), "{}", called.stderr);
+    // Further photographs beside them, a twentieth of the distance to the scene apart.
+    let file = place.path().join("scene/cameras.json");
+    let mut cameras: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let frames = cameras["frames"].as_array_mut().unwrap();
+    for i in 3..15 {
+        let images = place.path().join("scene/images");
+        let copy = format!("view{i}.png");
+        std::fs::copy(images.join(format!("view{}.png", i % 3)), images.join(&copy)).unwrap();
+        let mut frame = frames[i % 3].clone();
+        frame["file"] = format!("images/{copy}").into();
+        let x = frame["c2w"][0][3].as_f64().unwrap();
+        frame["c2w"][0][3] = (x + 0.01 * i as f64).into();
+        frames.push(frame);
+    }
+    std::fs::write(&file, cameras.to_string()).unwrap();
+    let called = call_in(place.path(), &format!("{quick} many"));
+    let report = done(&called);
+    assert_eq!(report["context"].as_array().unwrap().len(), 12);
+    assert!(called.stderr.contains("12 of them"), "{}", called.stderr);
+    let targets = report["targets"].as_array().unwrap();
+    assert!(!targets.is_empty() && targets.len() <= 3, "{targets:?}");
+}
+
+#[test]
 fn check_says_no_with_exit_code_3() {
     let place = workplace();
     let called = call_in(place.path(), "--json check scene --context 0,0");

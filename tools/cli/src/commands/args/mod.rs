@@ -73,9 +73,9 @@ pub struct Cli {
 pub enum Command {
     /// Make a 3D scene from photographs, and draw new views of it.
     ///
-    /// Two photographs of one place, taken a step apart, are enough. Up to twelve are all used. Of more,
-    /// twelve that overlap are used; --context names others. The output folder gets the scene (scene.ply), the views (images/,
-    /// depth/), their cameras (cameras.json) and metrics.json.
+    /// Two photographs of one place, taken a step apart, are enough. Up to twelve are all used (with --quality high or
+    /// best six). Of more, as many that overlap are used; --context names others. The output folder gets the scene
+    /// (scene.ply), the views (images/, depth/), their cameras (cameras.json) and metrics.json.
     Run(Box<RunArgs>),
     /// Draw pictures or an animation of a finished scene.
     Render(RenderArgs),

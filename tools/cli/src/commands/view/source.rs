@@ -123,7 +123,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
     scene.warnings.iter().for_each(print_warning);
     let first = args.input.first().context("no input")?;
-    let (context, reason) = run::context(&args.source.context, first, &scene)?;
+    let (context, reason) = run::context(&args.source, first, &scene)?;
     print_line(format!(
         "{}: {} photographs; the scene is made from {reason}",
         scene.name,
