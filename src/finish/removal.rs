@@ -1,15 +1,12 @@
 //! Gaussians by photograph, and the removal of those that the photographs hardly show.
 
 use super::TargetView;
-use super::parameters::GAIN_STRIDE;
 use crate::scene::render;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use rayon::prelude::*;
 use std::ops::Range;
-use subsplat_kernels::layout::{
-    Gradients, OPACITY_OFFSET, RasterOptions, SPLAT_STRIDE, SplatSlices, gain_with_offsets,
-};
+use subsplat_kernels::layout::{Gradients, RasterOptions, SplatSlices, gain_with_offsets};
 
 /// Fewest parents of a parallel task.
 const TASK: usize = 4096;
@@ -125,56 +122,4 @@ pub(crate) fn families(splats: &Splats, keep: &[bool]) -> Splats {
     };
     let (rows, sh, gain) = (part(&splats.rows), part(&splats.sh), part(&splats.gain));
     Splats { rows, sh, gain, sh_degree: splats.sh_degree, sh_basis: splats.sh_basis }
-}
-
-/// Writes `kept`, the families of `splats` that `keep` marks, back to them, with their gains and colour offsets.
-/// The others become transparent. `kept` has the SH sets of `splats`.
-#[cfg(feature = "network")]
-pub(crate) fn restore(splats: &mut Splats, keep: &[bool], kept: &Splats) {
-    let children = splats.children_per_parent();
-    splats.gain = gain_with_offsets(&splats.gain, splats.len());
-    let gain = gain_with_offsets(&kept.gain, kept.len());
-    let (rows_size, gain_size) = (children * SPLAT_STRIDE, children * GAIN_STRIDE);
-    let mut kept = kept.rows.chunks_exact(rows_size).zip(gain.chunks_exact(gain_size));
-    let rows = splats.rows.chunks_exact_mut(rows_size);
-    for ((rows, gain), keep) in rows.zip(splats.gain.chunks_exact_mut(gain_size)).zip(keep) {
-        if !keep {
-            rows.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
-        } else if let Some((kept_rows, kept_gain)) = kept.next() {
-            rows.copy_from_slice(kept_rows);
-            gain.copy_from_slice(kept_gain);
-        }
-    }
-}
-
-#[cfg(all(test, feature = "network"))]
-mod tests {
-    use super::*;
-    use subsplat_kernels::layout::ShBasis;
-
-    #[test]
-    fn what_the_photographs_hide_becomes_transparent() {
-        let row = |i: usize| vec![0.1 * (1 + i) as f32; SPLAT_STRIDE];
-        let mut splats = Splats {
-            rows: (0..6).flat_map(row).collect(),
-            sh: (0..9).map(|i| i as f32).collect(),
-            gain: Vec::new(),
-            sh_degree: 0,
-            sh_basis: ShBasis::default(),
-        };
-        assert_eq!((splats.parents(), splats.children_per_parent()), (3, 2));
-        let keep = [true, false, true];
-        let mut kept = families(&splats, &keep);
-        assert_eq!(kept.sh, [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]);
-        kept.rows.iter_mut().for_each(|v| *v += 1.0);
-        kept.gain = (0..16).map(|i| i as f32).collect();
-        restore(&mut splats, &keep, &kept);
-        let of = |i: usize| splats.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE].to_vec();
-        let moved = |i: usize| row(i).iter().map(|v| v + 1.0).collect::<Vec<_>>();
-        assert_eq!([0, 1, 4, 5].map(of), [0, 1, 4, 5].map(moved));
-        assert_eq!([2, 3].map(|i| splats.opacity(i)), [0.0, 0.0]);
-        assert_eq!(of(2)[..OPACITY_OFFSET], row(2)[..OPACITY_OFFSET]);
-        assert_eq!(splats.gain[..12], [0., 1., 2., 3., 4., 5., 6., 7., 1., 0., 0., 0.]);
-        assert_eq!(splats.gain[16..], [8., 9., 10., 11., 12., 13., 14., 15.]);
-    }
 }

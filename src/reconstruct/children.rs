@@ -16,7 +16,7 @@ use subsplat_kernels::cpu::detail::with_residuals;
 use subsplat_kernels::layout::{CHILDREN_MAX, RasterOptions};
 
 /// Numbers of a gain with colour offsets: γ, then δ.
-const GAIN_WITH_OFFSETS: usize = 4;
+pub(super) const GAIN_WITH_OFFSETS: usize = 4;
 
 /// Gaussians of a scene.
 pub struct SceneChildren {

@@ -15,12 +15,11 @@
 //! run at the input's size, enlarged by Lanczos: 19.44 / .676. What was tried and left out is in
 //! `src/network/shipped/README.md`.
 
+use super::children::GAIN_WITH_OFFSETS;
 use super::{Error, Result, finishing};
 use crate::cameras::dense::{DenseMatch, DenseView, match_depth};
 use crate::cameras::matches::GrayImage;
-use crate::finish::{
-    FitOptions, PhaseRun, RefineOptions, families, fit, hidden, refine, restore, shares,
-};
+use crate::finish::{FitOptions, PhaseRun, RefineOptions, families, fit, hidden, refine, shares};
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::reconstruct::inputs::pair::choose_sources;
 use crate::scene::render::Renderer;
@@ -29,7 +28,7 @@ use glam::Vec3;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::{Camera, NearFar};
 use subsplat_kernels::layout::{
-    MEAN_OFFSET, OPACITY_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE,
+    MEAN_OFFSET, OPACITY_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, gain_with_offsets,
 };
 
 /// Photographs with which each one is compared. Of five photographs, the scenes that chose the constants of
@@ -139,4 +138,55 @@ pub fn refine_parents(
     refine(&mut shown, &views, raster, options, renderer, &mut step).map_err(finishing::error)?;
     restore(parents, &keep, &shown);
     Ok(())
+}
+
+/// Writes `kept`, the families of `splats` that `keep` marks, back to them, with their gains and colour offsets.
+/// The others become transparent. `kept` has the SH sets of `splats`.
+fn restore(splats: &mut Splats, keep: &[bool], kept: &Splats) {
+    let children = splats.children_per_parent();
+    splats.gain = gain_with_offsets(&splats.gain, splats.len());
+    let gain = gain_with_offsets(&kept.gain, kept.len());
+    let (rows_size, gain_size) = (children * SPLAT_STRIDE, children * GAIN_WITH_OFFSETS);
+    let mut kept = kept.rows.chunks_exact(rows_size).zip(gain.chunks_exact(gain_size));
+    let rows = splats.rows.chunks_exact_mut(rows_size);
+    for ((rows, gain), keep) in rows.zip(splats.gain.chunks_exact_mut(gain_size)).zip(keep) {
+        if !keep {
+            rows.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
+        } else if let Some((kept_rows, kept_gain)) = kept.next() {
+            rows.copy_from_slice(kept_rows);
+            gain.copy_from_slice(kept_gain);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use subsplat_kernels::layout::ShBasis;
+
+    #[test]
+    fn what_the_photographs_hide_becomes_transparent() {
+        let row = |i: usize| vec![0.1 * (1 + i) as f32; SPLAT_STRIDE];
+        let mut splats = Splats {
+            rows: (0..6).flat_map(row).collect(),
+            sh: (0..9).map(|i| i as f32).collect(),
+            gain: Vec::new(),
+            sh_degree: 0,
+            sh_basis: ShBasis::default(),
+        };
+        assert_eq!((splats.parents(), splats.children_per_parent()), (3, 2));
+        let keep = [true, false, true];
+        let mut kept = families(&splats, &keep);
+        assert_eq!(kept.sh, [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]);
+        kept.rows.iter_mut().for_each(|v| *v += 1.0);
+        kept.gain = (0..16).map(|i| i as f32).collect();
+        restore(&mut splats, &keep, &kept);
+        let of = |i: usize| splats.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE].to_vec();
+        let moved = |i: usize| row(i).iter().map(|v| v + 1.0).collect::<Vec<_>>();
+        assert_eq!([0, 1, 4, 5].map(of), [0, 1, 4, 5].map(moved));
+        assert_eq!([2, 3].map(|i| splats.opacity(i)), [0.0, 0.0]);
+        assert_eq!(of(2)[..OPACITY_OFFSET], row(2)[..OPACITY_OFFSET]);
+        assert_eq!(splats.gain[..12], [0., 1., 2., 3., 4., 5., 6., 7., 1., 0., 0., 0.]);
+        assert_eq!(splats.gain[16..], [8., 9., 10., 11., 12., 13., 14., 15.]);
+    }
 }

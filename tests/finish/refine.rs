@@ -236,6 +236,41 @@ fn a_time_limit_ends_the_steps_and_their_rates() {
 
 /// Three planes for three photographs, the third one behind the others. The third shows nothing,
 /// and of two photographs nothing is removed.
+/// Three photographs show a surface from enough sides for colours by direction, and contradict Gaussians that
+/// make up for each other's errors.
+#[test]
+fn three_photographs_move_sh_and_leave_gaussians_out_of_steps() {
+    let (cameras, truth) = (cameras(), pictures(&plane(0.6, 0.9)));
+    let parts = displaced(0.4).into_parts();
+    let count = parts.rows.len() / SPLAT_STRIDE;
+    let start =
+        Splats::new(parts.rows, vec![0.1; 12 * count], Vec::new(), 1, parts.sh_basis).unwrap();
+    let run = |photographs: usize, dropout: f32| {
+        let views: Vec<TargetView<'_>> = [0, 1, 0][..photographs]
+            .iter()
+            .map(|&i| TargetView { camera: &cameras[i], image: &truth[i] })
+            .collect();
+        let mut options = RefineOptions::default().with_steps(12);
+        options.dropout = dropout;
+        let (mut splats, mut renderer) = (start.clone(), Renderer::default());
+        let mut go_on = |_: &PhaseRun<'_>| ControlFlow::Continue(());
+        let raster = RasterOptions::default();
+        let report =
+            refine(&mut splats, &views, &raster, &options, &mut renderer, &mut go_on).unwrap();
+        assert!(report.after < report.before, "{report:?}");
+        splats
+    };
+    let [two, two_dropped] = [0.0, 0.5].map(|dropout| run(2, dropout));
+    assert!(two == two_dropped && two.sh() == start.sh());
+    let [three, three_dropped] = [0.0, 0.5].map(|dropout| run(3, dropout));
+    assert!(three.rows() != three_dropped.rows() && three.sh() != start.sh());
+    assert!(three_dropped == run(3, 0.5));
+    // The constant term stays: δ moves in its place.
+    let constant =
+        |s: &Splats| s.sh().chunks(12).flat_map(|set| set[..3].to_vec()).collect::<Vec<_>>();
+    assert_eq!(constant(&three), constant(&start));
+}
+
 #[test]
 fn parents_that_no_photograph_shows_are_removed() {
     let (cameras, truth) = (cameras(), pictures(&plane(0.6, 0.9)));
