@@ -114,7 +114,7 @@ pub fn options_of_parents(scene: &RefineOptions, inputs: &[Cropped]) -> Option<R
 }
 
 /// Fits and refines `parents` on the photographs of the input's size, which `raster` renders, by
-/// [`options_of_parents`]. Those that the photographs hardly show ([`hidden`]) become transparent instead, and
+/// [`options_of_parents`]. Those that the photographs hardly show become transparent instead, and
 /// get no children. `progress` receives the share that is done.
 ///
 /// # Errors

@@ -201,8 +201,8 @@ pub fn choose_pair(scene: &Scene) -> Option<Pair> {
 
 /// Selects the frames of a scene that is made from `most` photographs at most, 2 or more: the best pair
 /// ([`choose_pair`]), then again and again the frame that overlaps least with those chosen before, but by
-/// [`LINK_OVERLAP`]; where none does, the one that overlaps most. Frames that overlap with none by
-/// [`LEAST_OVERLAP`] are left out. In ascending order.
+/// 70 %; where none does, the one that overlaps most. Frames that overlap with none by
+/// 30 % are left out. In ascending order.
 ///
 /// Returns `None` if the scene has no two frames at different positions.
 pub fn choose_photographs(scene: &Scene, most: usize) -> Option<Vec<usize>> {
