@@ -6,7 +6,7 @@
 //! Which ones is a hash of step and Gaussian. The same input gives the same bytes on any number of threads.
 
 use rayon::prelude::*;
-use subsplat_kernels::layout::{OPACITY_OFFSET, SPLAT_STRIDE};
+use subsplat_kernels::layout::{OPACITY_OFFSET, SPLAT_STRIDE, random};
 
 /// Fewest photographs of which a step leaves Gaussians out.
 const PHOTOGRAPHS_MIN: usize = 3;
@@ -39,12 +39,8 @@ impl Dropout {
 
     /// Returns whether the step leaves out Gaussian `i`.
     fn leaves_out(&self, i: usize) -> bool {
-        // SplitMix64 (Steele, Lea, Flood 2014).
-        let mut x = ((self.step << 32) ^ i as u64).wrapping_add(1);
-        x = x.wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((x >> 32) as u32) < self.limit
+        let key = ((self.step << 32) ^ i as u64).wrapping_add(1);
+        ((random::mix(key.wrapping_mul(random::GOLDEN)) >> 32) as u32) < self.limit
     }
 
     /// Writes the Gaussians of the step to `drawn`: `rows` `[N, 11]` with other opacities.

@@ -37,7 +37,7 @@ pub(crate) use refine::refine_groups;
 #[cfg(feature = "network")]
 pub use removal::Groups;
 #[cfg(feature = "network")]
-pub(crate) use removal::{LEAST_SHARE, families, hidden, shares};
+pub(crate) use removal::{LEAST_SHARE, families, hidden, shares, shown};
 
 use thiserror::Error;
 

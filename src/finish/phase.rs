@@ -163,8 +163,6 @@ pub(super) struct Phase {
     pub least_covered: f64,
     /// Parents with a smaller share of three photographs or more are removed first.
     pub least_share: f32,
-    /// SH coefficients stay where there are fewer photographs, or where Gaussians share a set.
-    pub photographs_of_sh: usize,
     /// Share of the Gaussians that a step leaves out, times the number of photographs
     /// ([`super::dropout::share`]).
     pub dropout: f32,
@@ -192,7 +190,6 @@ impl Phase {
             spares_edges: false,
             least_covered: 0.0,
             least_share: 0.0,
-            photographs_of_sh: 0,
             dropout: 0.0,
         }
     }
@@ -222,7 +219,6 @@ impl Phase {
             spares_edges: true,
             least_covered: LEAST_COVERED,
             least_share: options.least_share,
-            photographs_of_sh: PHOTOGRAPHS_OF_SH,
             dropout: options.dropout,
         }
     }
@@ -231,7 +227,7 @@ impl Phase {
     pub fn of(&self, splats: &Splats, photographs: usize) -> Self {
         let mut phase = self.clone();
         let own_sets = splats.sh_degree > 0 && splats.children_per_parent() == 1;
-        if !own_sets || photographs < self.photographs_of_sh {
+        if !own_sets || photographs < PHOTOGRAPHS_OF_SH {
             phase.moves.retain(|m| m.parameter.buffer != Buffer::Sh);
         }
         phase.moves.retain(|m| m.rate > 0.0);

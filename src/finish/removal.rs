@@ -47,6 +47,21 @@ pub(crate) fn hidden(shares: &[f32], photographs: usize, least_share: f32) -> Ve
     shares.iter().map(|share| enough && *share < least_share).collect()
 }
 
+/// Parents that are not [`hidden`], marked by true; `None` where all stay.
+pub(crate) fn shown(
+    splats: &Splats,
+    views: &[TargetView<'_>],
+    raster: &RasterOptions,
+    least_share: f32,
+    renderer: &mut Renderer,
+) -> Option<Vec<bool>> {
+    if views.len() < PHOTOGRAPHS_TO_REMOVE || !(least_share > 0.0) {
+        return None;
+    }
+    let hidden = hidden(&shares(splats, views, raster, renderer), views.len(), least_share);
+    hidden.contains(&true).then(|| hidden.into_iter().map(|hidden| !hidden).collect())
+}
+
 /// The Gaussians without the parents that are [`hidden`]; `None` where all stay.
 pub(super) fn pruned(
     splats: &Splats,
@@ -56,14 +71,10 @@ pub(super) fn pruned(
     least_share: f32,
     renderer: &mut Renderer,
 ) -> Option<(Splats, Groups)> {
-    let photographs = groups.ranges.len();
-    let may_remove = photographs >= PHOTOGRAPHS_TO_REMOVE && groups.equal_families;
-    if !may_remove || !(least_share > 0.0) {
+    if !groups.equal_families {
         return None;
     }
-    let shares = shares(splats, views, raster, renderer);
-    let hidden = hidden(&shares, photographs, least_share);
-    let keep: Vec<bool> = hidden.into_iter().map(|hidden| !hidden).collect();
+    let keep = shown(splats, views, raster, least_share, renderer)?;
     let children = splats.children_per_parent();
     let mut end = 0;
     let ranges: Vec<Range<usize>> = groups
@@ -76,8 +87,7 @@ pub(super) fn pruned(
             begin..end
         })
         .collect();
-    let some = end > 0 && keep.contains(&false);
-    some.then(|| (families(splats, &keep), Groups { ranges, equal_families: true }))
+    (end > 0).then(|| (families(splats, &keep), Groups { ranges, equal_families: true }))
 }
 
 /// Share of each parent in the photographs: the weights T·α of its children, summed over all

@@ -19,7 +19,7 @@ use super::children::GAIN_WITH_OFFSETS;
 use super::{Error, Result, finishing};
 use crate::cameras::dense::{DenseMatch, DenseView, match_depth};
 use crate::cameras::matches::GrayImage;
-use crate::finish::{FitOptions, PhaseRun, RefineOptions, families, fit, hidden, refine, shares};
+use crate::finish::{FitOptions, PhaseRun, RefineOptions, families, fit, refine, shown};
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::reconstruct::inputs::pair::choose_sources;
 use crate::scene::render::Renderer;
@@ -39,7 +39,7 @@ const SOURCES: usize = 2;
 const STEPS: usize = 2;
 /// Most steps of parents.
 const STEPS_MAX: usize = 160;
-/// Least share of a parent of three photographs or more that is optimised ([`hidden`]). Five photographs of the
+/// Least share of a parent of three photographs or more that is optimised ([`shown`]). Five photographs of the
 /// scenes that chose the constants of [`crate::cameras::dense`] have 23.87 dB / .791 with 0.3, 23.94 / .793 with 0.15,
 /// 23.96 / .794 with 0.05; parents of seventeen take 31 s with 0.3 and 47 s with 0.05.
 const PARENTS_SHARE: f32 = 0.1;
@@ -128,15 +128,17 @@ pub fn refine_parents(
     progress: &mut dyn FnMut(f32) -> ControlFlow<()>,
 ) -> Result<()> {
     let views = finishing::input_views(inputs);
-    let hidden = hidden(&shares(parents, &views, raster, renderer), inputs.len(), PARENTS_SHARE);
-    let keep: Vec<bool> = hidden.into_iter().map(|hidden| !hidden).collect();
-    let mut shown = families(parents, &keep);
+    let keep = shown(parents, &views, raster, PARENTS_SHARE, renderer);
+    let mut kept = keep.as_ref().map(|keep| families(parents, keep));
+    let moved = kept.as_mut().unwrap_or(parents);
     let mut step = |_: usize| progress(0.0);
     let sizes = FitOptions::default();
-    fit(&mut shown, &views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;
+    fit(moved, &views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;
     let mut step = |phase: &PhaseRun<'_>| progress(phase.progress());
-    refine(&mut shown, &views, raster, options, renderer, &mut step).map_err(finishing::error)?;
-    restore(parents, &keep, &shown);
+    refine(moved, &views, raster, options, renderer, &mut step).map_err(finishing::error)?;
+    if let (Some(keep), Some(kept)) = (keep, kept) {
+        restore(parents, &keep, &kept);
+    }
     Ok(())
 }
 

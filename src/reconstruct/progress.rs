@@ -44,7 +44,7 @@ pub enum Stage {
     Detail,
     /// Sizes, opacities and colours are fitted to the photographs.
     Fit,
-    /// All parameters but the SH coefficients are refined on the photographs.
+    /// All parameters are refined on the photographs; SH coefficients from three photographs on.
     Refine,
 }
 

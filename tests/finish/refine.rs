@@ -234,8 +234,6 @@ fn a_time_limit_ends_the_steps_and_their_rates() {
     assert!(begun.elapsed() < Duration::from_secs(30));
 }
 
-/// Three planes for three photographs, the third one behind the others. The third shows nothing,
-/// and of two photographs nothing is removed.
 /// Three photographs show a surface from enough sides for colours by direction, and contradict Gaussians that
 /// make up for each other's errors.
 #[test]
@@ -271,6 +269,8 @@ fn three_photographs_move_sh_and_leave_gaussians_out_of_steps() {
     assert_eq!(constant(&three), constant(&start));
 }
 
+/// Three planes for three photographs, the third one behind the others. The third shows nothing,
+/// and of two photographs nothing is removed.
 #[test]
 fn parents_that_no_photograph_shows_are_removed() {
     let (cameras, truth) = (cameras(), pictures(&plane(0.6, 0.9)));

@@ -422,7 +422,7 @@ mod tests {
 
     #[test]
     fn a_scene_of_many_photographs_is_covered_by_linked_ones() {
-        // Sideways in steps of 0.1 at a depth of 3, 0.5 % of overlap each; then cameras elsewhere.
+        // Sideways in steps of 0.1 at a depth of 3; then cameras elsewhere.
         let mut walk: Vec<Camera> =
             (0..40u8).map(|i| camera(0.0, Vec3::X * 0.1 * f32::from(i))).collect();
         walk.extend((0..5u8).map(|i| camera(3.0, Vec3::X * 0.1 * f32::from(i))));
