@@ -1,9 +1,12 @@
 //! A refinement step ([`subsplat::finish::refine()`]) on one photograph beside the forward and backward pass
 //! of the rasterizer alone, on the rasterizer's scenes (`common/scene.rs`). A step adds the loss
 //! with its gradient and Adam's step of all Gaussians. The photograph is the scene's own picture
-//! with other colours.
+//! with other colours. `-- curve FOLDER…` prints the score of new views over the seconds of a refinement
+//! instead (`refine/curve.rs`).
 
 mod common;
+#[path = "refine/curve.rs"]
+mod curve;
 
 use anyhow::{Context, Result, ensure};
 use common::scene::{self, SCENES};
@@ -18,6 +21,12 @@ use subsplat_kernels::layout::{Gradients, RasterOptions};
 const NAMES: [&str; 2] = ["131k-256", "524k-512"];
 
 fn main() -> Result<()> {
+    let words: Vec<String> = std::env::args().skip(1).filter(|word| word != "--bench").collect();
+    if let Some((first, rest)) = words.split_first()
+        && first == "curve"
+    {
+        return curve::print(rest);
+    }
     let mut bench = Bench::new("refine")?;
     for spec in SCENES.iter().filter(|s| NAMES.contains(&s.name)) {
         let name = format!("step {}", spec.name);

@@ -56,7 +56,8 @@ pub(super) struct Optimiser<'a> {
     /// `[N]` or empty: Gaussians of which only the colours move.
     spared: Vec<bool>,
     /// For each block of Gaussians: values, first moments and second moments, each `[E][BLOCK]`, E the
-    /// elements of all `moves`; then the sum of the gradients where a step has several photographs.
+    /// elements of all `moves`; then the sum of the gradients where a step has several photographs. Empty
+    /// before the first step.
     states: Vec<f32>,
     /// Parts of a block's state: 3, or 4 with the sum.
     parts: usize,
@@ -91,6 +92,25 @@ impl Scratch {
     }
 }
 
+/// Numbers of optimised Gaussians.
+pub(super) struct Numbers {
+    rows: Vec<f32>,
+    /// `[N, 4]`.
+    gain: Vec<f32>,
+    /// `[N, 3·D]`, or empty where the SH coefficients stayed.
+    sh: Vec<f32>,
+}
+
+impl Numbers {
+    /// Writes the numbers to the Gaussians that they were optimised from.
+    pub fn write_to(self, splats: &mut Splats) {
+        (splats.rows, splats.gain) = (self.rows, self.gain);
+        if !self.sh.is_empty() {
+            splats.sh = self.sh;
+        }
+    }
+}
+
 impl<'a> Optimiser<'a> {
     /// Prepares `splats` for the phase, whose steps have `photographs` photographs. `pixels` and
     /// `spared` are those of the fields.
@@ -102,7 +122,6 @@ impl<'a> Optimiser<'a> {
         spared: Vec<bool>,
     ) -> Self {
         let parts = if photographs > 1 { 4 } else { 3 };
-        let elements: usize = phase.moves.iter().map(|m| m.parameter.elements()).sum();
         let moves_sh = phase.moves.iter().any(|m| m.parameter.buffer == Buffer::Sh);
         let mut new = Self {
             before: splats,
@@ -112,7 +131,7 @@ impl<'a> Optimiser<'a> {
             scale: 1.0,
             pixels,
             spared,
-            states: vec![0.0; splats.len().div_ceil(BLOCK) * parts * elements * BLOCK],
+            states: Vec::new(),
             parts,
             rows: splats.rows.clone(),
             gain: gain_with_offsets(&splats.gain, splats.len()),
@@ -153,11 +172,22 @@ impl<'a> Optimiser<'a> {
                 row[OPACITY_OFFSET] = row[OPACITY_OFFSET].clamp(margin, 1.0 - margin);
             }
         });
+        self.states = Vec::new();
+    }
+
+    /// Takes the states of all blocks out of [`Optimiser::states`]. Before the first step they are new:
+    /// values of 0, but for the logits of the opacities.
+    fn take_states(&mut self) -> Vec<f32> {
+        let mut states = std::mem::take(&mut self.states);
+        if !states.is_empty() {
+            return states;
+        }
         let size = self.block_size();
+        states = vec![0.0; self.rows.len().div_ceil(BLOCK * SPLAT_STRIDE) * size];
         let mut at = 0;
         for m in &self.moves {
             if m.parameter == OPACITY {
-                let blocks = self.states.par_chunks_exact_mut(size);
+                let blocks = states.par_chunks_exact_mut(size);
                 blocks.zip(self.rows.par_chunks(BLOCK * SPLAT_STRIDE)).for_each(|(state, rows)| {
                     let logits = state[at * BLOCK..].iter_mut();
                     for (to, row) in logits.zip(rows.chunks_exact(SPLAT_STRIDE)) {
@@ -168,6 +198,7 @@ impl<'a> Optimiser<'a> {
             }
             at += m.parameter.elements();
         }
+        states
     }
 
     /// The Gaussians as they are now, as the rasterizer reads them.
@@ -197,11 +228,10 @@ impl<'a> Optimiser<'a> {
         Splats { rows, sh, gain, sh_degree, sh_basis: self.before.sh_basis }
     }
 
-    /// The Gaussians as they are now.
-    pub fn into_splats(self) -> Splats {
-        let Self { rows, gain, sh, before, .. } = self;
-        let sh = if sh.is_empty() { before.sh.clone() } else { sh };
-        Splats { rows, sh, gain, sh_degree: before.sh_degree, sh_basis: before.sh_basis }
+    /// The numbers of the Gaussians as they are now, without those that stayed.
+    pub fn into_numbers(self) -> Numbers {
+        let Self { rows, gain, sh, .. } = self;
+        Numbers { rows, gain, sh }
     }
 
     /// SH coefficients of a Gaussian, where each has a set.
@@ -213,7 +243,7 @@ impl<'a> Optimiser<'a> {
     pub fn add(&mut self, photograph: &PhotographGradients<'_>) {
         let size = self.block_size();
         let part = self.elements() * BLOCK;
-        let mut states = std::mem::take(&mut self.states);
+        let mut states = self.take_states();
         let rows = self.rows.par_chunks(BLOCK * SPLAT_STRIDE);
         states.par_chunks_exact_mut(size).zip(rows).enumerate().with_min_len(TASK).for_each_init(
             || Scratch::new(part / BLOCK),
@@ -238,7 +268,7 @@ impl<'a> Optimiser<'a> {
         };
         let size = self.block_size();
         let part = self.elements() * BLOCK;
-        let mut states = std::mem::take(&mut self.states);
+        let mut states = self.take_states();
         let (mut rows, mut gain) = (std::mem::take(&mut self.rows), std::mem::take(&mut self.gain));
         let mut sh = std::mem::take(&mut self.sh);
         let mut sh_of_blocks: Vec<&mut [f32]> = sh.chunks_mut(BLOCK * self.sh_stride()).collect();
@@ -407,7 +437,7 @@ impl<'a> Optimiser<'a> {
 
     /// The gradients by the Gaussians `range`.
     fn part_of<'g>(&self, gradients: &'g Gradients, range: Range<usize>) -> Part<'g> {
-        let sh_stride = self.sh_stride();
+        let sh_stride = 3 * gradients.coefficients(self.before.sh_degree);
         let sh = gradients.sh.get(range.start * sh_stride..range.end * sh_stride);
         Part {
             rows: &gradients.rows[range.start * SPLAT_STRIDE..range.end * SPLAT_STRIDE],

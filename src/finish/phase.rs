@@ -234,6 +234,12 @@ impl Phase {
         phase
     }
 
+    /// SH coefficients of each channel that move, with those before them.
+    pub fn sh_coefficients(&self) -> usize {
+        let sh = self.moves.iter().map(|m| m.parameter).filter(|p| p.buffer == Buffer::Sh);
+        sh.map(|p| (p.first + p.elements()).div_ceil(3)).max().unwrap_or(0)
+    }
+
     /// Returns whether `parameter` moves.
     pub fn moves(&self, parameter: Parameter) -> bool {
         self.moves.iter().any(|m| m.parameter == parameter)

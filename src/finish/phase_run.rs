@@ -92,6 +92,8 @@ impl<'a> PhaseRun<'a> {
             Photographs::InTurn => 1,
         };
         let phase = phase.of(splats, views.len());
+        let gradients =
+            Gradients { sh_limit: Some(phase.sh_coefficients()), ..Gradients::default() };
         Ok(Self {
             targets,
             raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
@@ -99,8 +101,8 @@ impl<'a> PhaseRun<'a> {
             begun: None,
             optimiser: Optimiser::new(splats, &phase, photographs, pixels, spared),
             phase,
-            gradients: Gradients::default(),
-            across: Gradients::default(),
+            across: Gradients { sh_limit: Some(0), ..Gradients::default() },
+            gradients,
             drawn: Vec::new(),
             step: 0,
         })
@@ -315,12 +317,13 @@ pub(super) fn run(
     if !(after < before) {
         return Ok(Outcome::unchanged(steps, before));
     }
-    let optimised = phase_run.optimiser.into_splats();
-    let removed = splats.len() - optimised.len();
-    if let Some((_, kept_groups)) = pruned {
-        *groups = kept_groups;
+    let optimised = phase_run.optimiser.into_numbers();
+    let before_removal = splats.len();
+    if let Some((kept, kept_groups)) = pruned {
+        (*splats, *groups) = (kept, kept_groups);
     }
-    *splats = optimised;
+    let removed = before_removal - splats.len();
+    optimised.write_to(splats);
     Ok(Outcome { steps, before, after, removed })
 }
 

@@ -105,7 +105,7 @@ pub(crate) fn shares(
     let slices = SplatSlices { gain: &gain, ..render::slices(splats) };
     let mut shares = vec![0.0f32; parents];
     let mut pixels = 0;
-    let mut gradients = Gradients::default();
+    let mut gradients = Gradients { sh_limit: Some(0), ..Gradients::default() };
     for view in views {
         let count = view.image.width * view.image.height;
         pixels += count;

@@ -2,6 +2,7 @@
 
 use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result};
 use crate::finish::{FitOptions, RefineOptions};
+use std::fmt;
 use std::time::Duration;
 use subsplat_kernels::camera::{Camera, Size};
 
@@ -373,6 +374,19 @@ fn steps_of(each: usize, photographs: usize) -> usize {
     let thirds = (PHOTOGRAPHS_OF_MAX - 2) + (FACTOR_MAX - 1) * further;
     let steps = each.saturating_mul(thirds * photographs.min(PHOTOGRAPHS_MAX));
     steps.div_ceil(PHOTOGRAPHS_OF_MAX - 2)
+}
+
+/// As `--refine` of the programs reads it.
+impl fmt::Display for Refine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Auto => f.write_str("auto"),
+            Self::Off => f.write_str("off"),
+            Self::Each(steps) => write!(f, "{steps} a photograph"),
+            Self::Steps(steps) => write!(f, "{steps}"),
+            Self::Seconds(seconds) => write!(f, "{seconds}s"),
+        }
+    }
 }
 
 impl Refine {

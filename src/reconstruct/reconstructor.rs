@@ -215,7 +215,9 @@ impl Reconstructor {
             poses::refuse_bad(&reports)?;
         }
         let mut warnings = Warning::of_reports(&reports);
-        warnings.extend(Warning::of_crops(photos, &inputs, &crop));
+        let cut_shares: Vec<f32> =
+            inputs.iter().zip(sizes).map(|(c, size)| cut_share(c, size)).collect();
+        warnings.extend(Warning::of_crops(photos, &inputs, &cut_shares, &crop));
         warnings.extend(corrected);
         if self.missing > 0 {
             let upscale = self.config().upscale;
@@ -223,7 +225,6 @@ impl Reconstructor {
         }
         let bounds = guess.refined(options.depth_range, &reports);
         let options = options.clone();
-        let cut_shares = inputs.iter().zip(sizes).map(|(c, size)| cut_share(c, size)).collect();
         Ok(Prepared {
             model: self,
             options,

@@ -6,6 +6,10 @@ use crate::reconstruct::inputs::crop::{CropOptions, Cropped};
 use std::fmt;
 use subsplat_kernels::camera::Size;
 
+/// Share of a photograph that is cut, beyond which a warning says so: 44 % of a portrait of 3:4 in a
+/// landscape of 4:3, or of 9:16 in a square.
+const MUCH: f32 = 0.4;
+
 /// A circumstance that may spoil the result. [`fmt::Display`] gives one sentence without a final
 /// full stop.
 #[derive(Clone, Debug, PartialEq)]
@@ -44,6 +48,16 @@ pub enum Warning {
         size: Size,
         /// Size after resizing.
         resized: Size,
+    },
+    /// The pictures have another shape than a photograph, of which more than 40 % is cut.
+    #[non_exhaustive]
+    PhotographCut {
+        /// Size of the photograph.
+        size: Size,
+        /// Size of the picture.
+        picture: Size,
+        /// Share that no picture shows, 0 to 1.
+        share: f32,
     },
     /// The weights lack some or all of SubSplat's tensors, the heads that place children.
     #[non_exhaustive]
@@ -92,6 +106,12 @@ impl fmt::Display for Warning {
                 f,
                 "a photograph of {size} is enlarged to {resized}: pictures of this size show no \
                  more detail than the photograph has"
+            ),
+            Self::PhotographCut { size, picture, share } => write!(
+                f,
+                "{:.0} % of a photograph of {size} is cut at its edges: pictures of {picture} have \
+                 another shape",
+                100.0 * share
             ),
             Self::UntrainedTensors { count, upscale } => {
                 write!(
@@ -151,10 +171,12 @@ impl Warning {
         reports.iter().enumerate().flat_map(pair).collect()
     }
 
-    /// Sizes that were cut, and photographs that were enlarged; each warning once.
+    /// Sizes that were cut, photographs that were enlarged, and those that lose more than [`MUCH`]; each
+    /// warning once.
     pub(super) fn of_crops(
         photos: &[Photo],
         inputs: &[Cropped],
+        cut_shares: &[f32],
         options: &CropOptions,
     ) -> Vec<Self> {
         let mut warnings = Vec::new();
@@ -177,6 +199,12 @@ impl Warning {
                 let side = |side: usize, scale: f32| (side as f32 / scale).round() as usize;
                 let resized = Size::new(side(size.width, scale.x), side(size.height, scale.y));
                 add(Self::PhotographEnlarged { size, resized });
+            }
+        }
+        for ((photo, c), &share) in photos.iter().zip(inputs).zip(cut_shares) {
+            if share > MUCH {
+                let picture = Size::new(c.target.width, c.target.height);
+                add(Self::PhotographCut { size: photo.size(), picture, share });
             }
         }
         warnings

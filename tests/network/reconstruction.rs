@@ -194,8 +194,19 @@ fn the_input_has_the_shape_of_the_photographs() {
             assert!((crop.window.scale.x / crop.window.scale.y - 1.0).abs() < 0.01, "{w}x{h}");
             assert!((share - cut).abs() < 0.01, "{w}x{h}: {share}");
         }
-        assert!(!prepared.warnings().iter().any(|w| matches!(w, Warning::InputSizeCut { .. })));
+        let shape =
+            |w: &Warning| matches!(w, Warning::InputSizeCut { .. } | Warning::PhotographCut { .. });
+        assert!(!prepared.warnings().iter().any(shape));
     }
+    // Portraits as landscapes.
+    let portraits = whole::shoot(3, 2, 96, 160).photos;
+    let prepared = model.prepare(&portraits, &options.clone().with_input_size(160, 96)).unwrap();
+    let cut = |w: &Warning| matches!(w, Warning::PhotographCut { .. });
+    let sentences: Vec<String> =
+        prepared.warnings().iter().filter(|w| cut(w)).map(Warning::to_string).collect();
+    let expected = "64 % of a photograph of 96x160 is cut at its edges: pictures of 320x192 have \
+                    another shape";
+    assert_eq!(sentences, [expected]);
     // Two shapes share one input.
     let mut mixed = whole::shoot(3, 2, 160, 96).photos;
     mixed[1] = whole::shoot(3, 2, 96, 160).photos.remove(1);

@@ -6,7 +6,7 @@
 use subsplat_test_support::raster_scene;
 
 use glam::Vec3;
-use raster_scene::{KINDS, Kind, Random, SIZE, Scene};
+use raster_scene::{CHILDREN, KINDS, Kind, Random, SIZE, Scene};
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_kernels::cpu::{Gradients, Rasterizer, SimdLevel};
 use subsplat_kernels::layout::{
@@ -304,6 +304,41 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
             for limit in [0, pairs / 7] {
                 let (few, _) = run(2, Rasterizer::new().with_pairs_per_group(limit));
                 assert!(one == few, "{convention:?}: the memory limit changes gradients");
+            }
+        }
+    }
+}
+
+/// With and without siblings, by the directions of children and of parents.
+#[test]
+fn a_limit_of_sh_coefficients_leaves_the_other_gradients() {
+    for (degree, alone) in [(0, true), (1, false), (3, true), (3, false), (4, true), (4, false)] {
+        let mut scene = Scene::new(Kind::Plain, 40 + degree as u64, 40, degree, 4);
+        let set = 3 * sh_coefficients(degree);
+        if alone {
+            let sets = scene.sh.chunks_exact(set);
+            scene.sh = sets.flat_map(|set| set.repeat(CHILDREN)).collect();
+        }
+        for sh_direction in [ShDirection::Child, ShDirection::Parent] {
+            let o = RasterOptions { sh_direction, ..options(Convention::Standard) };
+            let v = scene.upstream(&o, 3);
+            // Used buffers of all coefficients.
+            let mut got = Gradients::default();
+            let backward = |out: &mut Gradients| {
+                let mut rasterizer = Rasterizer::new();
+                scene.with_slices(|s| rasterizer.backward(&s, &scene.camera, &o, &v, out));
+            };
+            backward(&mut got);
+            let all = got.clone();
+            for limit in [4, 0, 1, 25] {
+                got.sh_limit = Some(limit);
+                backward(&mut got);
+                let kept = set.min(3 * limit);
+                let sh = all.sh.chunks_exact(set).flat_map(|set| &set[..kept]).copied().collect();
+                let expected = Gradients { sh, sh_limit: Some(limit), ..all.clone() };
+                let what = format!("degree {degree}, alone {alone}, {sh_direction:?}, {limit}");
+                assert!(got == expected, "{what}");
+                assert_eq!(all.clone().limited(degree, Some(limit)), expected, "{what}");
             }
         }
     }

@@ -105,12 +105,15 @@ pub struct Gradients {
     pub cov6: Vec<f32>,
     /// `[N]` for [`Geometry::Cov6`], else empty.
     pub opacities: Vec<f32>,
-    /// `[P, D, 3]`: summed over the children of each parent.
+    /// `[P, D, 3]`: summed over the children of each parent. D is [`Gradients::coefficients`].
     pub sh: Vec<f32>,
     /// Shape of [`SplatSlices::gain`].
     pub gain: Vec<f32>,
     /// `[3]`: of the background.
     pub background: [f32; 3],
+    /// Set by the caller: the first SH coefficients of each channel whose gradients `sh` has. Default: all.
+    /// Sets of degree 4 are the largest part of the gradients, 300 bytes of 360.
+    pub sh_limit: Option<usize>,
 }
 
 impl Gradients {
@@ -123,13 +126,31 @@ impl Gradients {
         self.means.resize(3 * cov, 0.0);
         self.cov6.resize(6 * cov, 0.0);
         self.opacities.resize(cov, 0.0);
-        self.sh.resize(splats.sh.len(), 0.0);
+        self.sh.resize(splats.parents() * 3 * self.coefficients(splats.sh_degree), 0.0);
         self.gain.resize(splats.gain.len(), 0.0);
+    }
+
+    /// Coefficients of each channel whose gradients `sh` has, of sets of degree `sh_degree`.
+    pub fn coefficients(&self, sh_degree: usize) -> usize {
+        let all = sh_coefficients(sh_degree);
+        self.sh_limit.map_or(all, |limit| limit.min(all))
+    }
+
+    /// Removes the gradients of the coefficients beyond `limit` ([`Gradients::sh_limit`]) from those of all
+    /// coefficients of degree `sh_degree`.
+    #[must_use]
+    pub fn limited(mut self, sh_degree: usize, limit: Option<usize>) -> Self {
+        self.sh_limit = limit;
+        let (all, kept) = (3 * sh_coefficients(sh_degree), 3 * self.coefficients(sh_degree));
+        if kept < all {
+            self.sh = self.sh.chunks_exact(all).flat_map(|set| &set[..kept]).copied().collect();
+        }
+        self
     }
 
     /// Resizes every buffer for `splats` and fills it with zeros.
     pub(crate) fn clear(&mut self, splats: &SplatSlices) {
-        *self = Self::default();
+        *self = Self { sh_limit: self.sh_limit, ..Self::default() };
         self.fit(splats);
     }
 }

@@ -178,7 +178,7 @@ fn colours_by_direction_move_for_three_photographs() {
         all.step(&PhotographGradients { all: &by, across: None }, 0.5);
         let drawn = all.slices().sh.to_vec();
         assert_eq!(all.splats().sh, drawn);
-        (drawn, all.into_splats().sh)
+        (drawn, all.splats().sh)
     };
     let [(two, kept), (drawn, three)] = [2, 3].map(step);
     assert!(two == sh && kept == sh && drawn == three);

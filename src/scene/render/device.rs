@@ -139,8 +139,8 @@ impl Renderer {
     }
 
     /// Renders planes as [`Renderer::render_planes`] does, passes them to `loss`, which returns
-    /// the gradient by each of their elements, and writes the gradients by the splats to `out`.
-    /// `loss` is called again where a GPU fails.
+    /// the gradient by each of their elements, and writes the gradients by the splats to `out`,
+    /// within its [`Gradients::sh_limit`]. `loss` is called again where a GPU fails.
     pub(crate) fn gradients_of(
         &mut self,
         splats: &SplatSlices,
@@ -154,7 +154,7 @@ impl Renderer {
             let frame = rasterizer.frame(splats, camera, options);
             match frame.and_then(|(planes, mut frame)| frame.backward(&loss(&planes))) {
                 Ok(gradients) => {
-                    *out = gradients;
+                    *out = gradients.limited(splats.sh_degree, out.sh_limit);
                     return;
                 }
                 Err(e) => self.use_cpu(&e),

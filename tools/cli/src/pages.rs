@@ -23,11 +23,13 @@ use std::alloc::{GlobalAlloc, Layout, System};
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Pages;
 
-/// Returns the system allocator's free memory to the kernel.
+/// Returns free memory to the kernel, between stages that allocate blocks of other sizes.
 ///
 /// The matching of points frees hundreds of buffers of one to two megabytes, which glibc keeps:
-/// 26 MiB after two photographs of 1080x1920. The network allocates other sizes.
-pub fn trim_small_blocks() {
+/// 26 MiB after two photographs of 1080x1920. The refinement frees large blocks beside which the
+/// pictures of a finished scene need new ones below 2 MiB.
+pub fn trim() {
+    large::clear();
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
         unsafe extern "C" {
@@ -110,7 +112,6 @@ mod large {
 
     pub(super) fn free(_: *mut u8, _: usize) {}
 
-    #[cfg(test)]
     pub(super) fn clear() {}
 }
 
@@ -261,7 +262,6 @@ mod large {
     }
 
     /// Unmaps all free blocks.
-    #[cfg(test)]
     pub(super) fn clear() {
         while let Some(block) = free_list().take_oldest(usize::MAX) {
             unmap(block.at, block.length);

@@ -52,10 +52,10 @@ impl Directions {
         }
     }
 
-    /// Writes Y ⊗ `g` of lane `l` over one SH set.
+    /// Writes Y ⊗ `g` of lane `l` over one SH set, or its first coefficients.
     #[inline(always)]
     fn write_to(&self, sh: &mut [f32], l: usize, used: usize, g: [f32; 3]) {
-        let (sh, unused) = sh.split_at_mut(3 * used);
+        let (sh, unused) = sh.split_at_mut(sh.len().min(3 * used));
         for (h, y) in sh.chunks_exact_mut(3).zip(&self.y[..used]) {
             h.copy_from_slice(&[y[l] * g[0], y[l] * g[1], y[l] * g[2]]);
         }
@@ -156,7 +156,7 @@ impl Pass<'_> {
             seen.weigh(l, used, sh, get(&group.sums, l)[6..9].try_into().unwrap_or_default());
         }
         seen.evaluate(used, self.options.sh_basis);
-        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        let set = part.set;
         for l in 0..GROUP.min(part.len - at) {
             let p = (at + l) / children;
             let Some(sh) = part.sh.get_mut(p * set..(p + 1) * set) else { continue };
@@ -226,12 +226,14 @@ impl Pass<'_> {
             s.store(moved, &mut group.d_mean[c]);
             s.store(gains * s.load(&group.sums[6 + c]), weighted);
         }
+        let set = part.set;
+        let new = if set > 0 { seen.spread(s, &weighted) } else { Default::default() };
         let (mut p, mut child) = (at / children, at % children);
-        for (l, new) in seen.spread(s, &weighted).iter().enumerate().take(part.len - at) {
+        for (l, new) in new.iter().enumerate().take(part.len - at) {
             if let Some(sh) = part.sh.get_mut(p * set..(p + 1) * set) {
-                let (used, unused) = sh.split_at_mut(3 * WIDE);
+                let (used, unused) = sh.split_at_mut(set.min(3 * WIDE));
                 if child == 0 {
-                    used.copy_from_slice(new.as_flattened());
+                    used.copy_from_slice(&new.as_flattened()[..used.len()]);
                     unused.fill(0.0);
                 } else if alive & (1 << l) != 0 {
                     for (to, new) in used.iter_mut().zip(new.as_flattened()) {
@@ -266,7 +268,7 @@ impl Pass<'_> {
     pub(crate) fn parent_colours(&self, part: &mut Part, seen: &mut Directions) {
         let children = self.splats.children_per_parent();
         let used = self.used();
-        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        let set = part.set;
         let parents = part.len.div_ceil(children);
         for first in (0..parents).step_by(GROUP) {
             let mut weighted = [[0.0f32; 3]; GROUP];

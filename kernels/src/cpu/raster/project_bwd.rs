@@ -15,7 +15,7 @@ use crate::cpu::raster::project::{Geometry, SplatSlices, floats_at};
 use crate::cpu::simd::{Kernel, Simd, SimdLevel};
 use crate::layout::{
     MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE,
-    ShDirection, sh_coefficients,
+    ShDirection,
 };
 use rayon::prelude::*;
 
@@ -50,6 +50,8 @@ pub(crate) struct Part<'a> {
     cov6: &'a mut [f32],
     opacities: &'a mut [f32],
     pub(crate) sh: &'a mut [f32],
+    /// Numbers of a parent in `sh`.
+    pub(crate) set: usize,
     gain: &'a mut [f32],
     /// Numbers of [`SplatSlices::gain`] per splat.
     gain_channels: usize,
@@ -93,13 +95,13 @@ impl Pass<'_> {
         let children = self.splats.children_per_parent();
         let families = (PART / children).max(1);
         let len = families * children;
-        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        let set = 3 * out.coefficients(self.splats.sh_degree);
         let gain_channels = self.splats.gain.len().checked_div(n).unwrap_or(0);
         let mut rows = out.rows.chunks_mut(len * SPLAT_STRIDE);
         let mut means = out.means.chunks_mut(3 * len);
         let mut cov6 = out.cov6.chunks_mut(6 * len);
         let mut opacities = out.opacities.chunks_mut(len);
-        let mut sh = out.sh.chunks_mut(families * set);
+        let mut sh = out.sh.chunks_mut((families * set).max(1));
         let mut gain = out.gain.chunks_mut((len * gain_channels).max(1));
         let parts: Vec<Part> = (0..n)
             .step_by(len)
@@ -111,6 +113,7 @@ impl Pass<'_> {
                 cov6: cov6.next().unwrap_or_default(),
                 opacities: opacities.next().unwrap_or_default(),
                 sh: sh.next().unwrap_or_default(),
+                set,
                 gain: gain.next().unwrap_or_default(),
                 gain_channels,
             })
@@ -252,8 +255,7 @@ impl Part<'_> {
         zero(self.opacities, 1);
         zero(self.gain, self.gain_channels);
         if let Some(children) = children {
-            let set = self.sh.len() / self.len.div_ceil(children);
-            let sets = at.div_ceil(children) * set..(at + count).div_ceil(children) * set;
+            let sets = at.div_ceil(children) * self.set..(at + count).div_ceil(children) * self.set;
             if let Some(sh) = self.sh.get_mut(sets) {
                 sh.fill(0.0);
             }

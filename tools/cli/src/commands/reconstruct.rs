@@ -171,10 +171,11 @@ pub fn reconstruct(
         let mut show = |progress| show_fraction(bar, progress);
         let prepared = model.prepare_with(photos.borrow(), options, &mut show)?;
         drop(photos);
-        pages::trim_small_blocks();
+        pages::trim();
         bar.suspend(|| print_prepared(&prepared, options.poses));
         let printed = prepared.warnings().len();
         let result = prepared.reconstruct_with(&mut show)?;
+        pages::trim();
         bar.suspend(|| print_reconstruction(&result, printed));
         Ok(result)
     })?;

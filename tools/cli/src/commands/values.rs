@@ -79,18 +79,24 @@ const REFINE_MAX: usize = 100_000;
 /// Largest number of seconds of `--refine`.
 const REFINE_SECONDS_MAX: usize = 86_400;
 
-/// Parses the length of a refinement: `auto`, `off`, steps, or seconds with an `s`.
+/// Parses the length of a refinement: `auto`, `off`, steps, seconds with an `s`, or minutes with an `m`.
 pub fn refine(text: &str) -> Result<Refine, String> {
     let text = text.trim();
-    let length = match (text, text.strip_suffix('s')) {
-        ("auto", _) => return Ok(Refine::Auto),
-        ("off", _) => return Ok(Refine::Off),
-        (_, Some(seconds)) => {
-            whole(seconds, 1, REFINE_SECONDS_MAX).map(|s| Refine::Seconds(s as u32))
+    let seconds = |n: usize| Refine::Seconds(n as u32);
+    let length = match text {
+        "auto" => return Ok(Refine::Auto),
+        "off" => return Ok(Refine::Off),
+        _ => {
+            if let Some(n) = text.strip_suffix('s') {
+                whole(n, 1, REFINE_SECONDS_MAX).map(seconds)
+            } else if let Some(n) = text.strip_suffix('m') {
+                whole(n, 1, REFINE_SECONDS_MAX / 60).map(|n| seconds(60 * n))
+            } else {
+                whole(text, 0, REFINE_MAX).map(Refine::Steps)
+            }
         }
-        (steps, None) => whole(steps, 0, REFINE_MAX).map(Refine::Steps),
     };
-    length.map_err(|e| format!("expected auto, off, steps or 20s: {}", &e["expected ".len()..]))
+    length.map_err(|e| format!("expected auto, off, steps, 20s or 2m: {}", &e["expected ".len()..]))
 }
 
 /// Parses frames a second; a GIF counts hundredths of a second.
@@ -227,9 +233,13 @@ mod tests {
         assert_eq!(refine(" off"), Ok(Refine::Off));
         assert_eq!(refine("40"), Ok(Refine::Steps(40)));
         assert_eq!(refine("20s"), Ok(Refine::Seconds(20)));
-        for bad in ["", "s", "0s", "-3", "1.5s", "100001", "86401s", "fast"] {
+        assert_eq!(refine("2m"), Ok(Refine::Seconds(120)));
+        for length in ["auto", "off", "40", "20s"] {
+            assert_eq!(refine(length).unwrap().to_string(), length);
+        }
+        for bad in ["", "s", "0s", "m", "-3", "1.5s", "100001", "86401s", "1441m", "fast"] {
             assert!(
-                refine(bad).unwrap_err().starts_with("expected auto, off, steps or 20s"),
+                refine(bad).unwrap_err().starts_with("expected auto, off, steps, 20s or 2m"),
                 "{bad}"
             );
         }

@@ -65,7 +65,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "auto | N | P% | K/px", value_parser = values::density, default_value = "auto")]
     pub gaussians: Density,
     /// Length of the refinement, as in `run`: of refine, enlarged, half and pair.
-    #[arg(long, value_name = "auto | off | N | 20s", value_parser = values::refine, default_value = "auto")]
+    #[arg(long, value_name = "auto | off | N | 20s | 2m", value_parser = values::refine, default_value = "auto")]
     pub refine: Refine,
     /// Score also PNG pictures of another program: DIR/SCENE/INPUTS/NNNNNN.png, or
     /// SCENE/color/NNNNNN.png, SCENE/NNNNNN.png, SCENE/FRAMENAME.png.

@@ -313,6 +313,9 @@ fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -
     let config = model.map(Reconstructor::config);
     json!({
         "data": args.data.display().to_string(),
+        "contexts": args.contexts,
+        "holdout": args.holdout,
+        "refine": args.refine.to_string(),
         "index": args.index.as_ref().map(|p| p.display().to_string()),
         "upscale": json_ratio(options.upscale),
         "crop": if options.rule == CropRule::Mvsplat { "mvsplat" } else { "exact" },

@@ -223,6 +223,14 @@ impl Benchmark {
             let expected = "at least 2 inputs, and scenes instead of chunks";
             return Err(Error::argument("inputs of each case", expected, count.to_string()));
         }
+        if let Some(every @ ..2) = held {
+            let expected = "2 or more, so that inputs remain";
+            return Err(Error::argument(
+                "frames from one target to the next",
+                expected,
+                every.to_string(),
+            ));
+        }
         let (mut cases, mut short) = (Vec::new(), Vec::new());
         for (i, scene) in self.scenes.iter().enumerate() {
             let Some(views) = spread(&scene.usable(), count, held) else {
@@ -234,8 +242,7 @@ impl Benchmark {
             cases.push(Case::new(&scene.name, views, resolution, Place::Scene(i)));
         }
         if cases.is_empty() {
-            let frames =
-                held.map_or(2 * count - 1, |every| count + count.div_ceil(every.max(2) - 1));
+            let frames = held.map_or(2 * count - 1, |every| count + count.div_ceil(every - 1));
             let expected = format!("a scene with {frames} frames or more");
             return Err(Error::argument("scenes", expected, "none"));
         }

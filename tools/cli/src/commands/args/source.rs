@@ -103,7 +103,7 @@ pub struct SourceArgs {
     /// Steps that move and reshape the splats so that new views become sharper.
     ///
     /// These steps follow those of --fit. Each step draws one photograph from the splats, and changes the
-    /// splats towards it. `off`; a number of steps; or a time, such as `20s`. `auto`: 16 steps for two
+    /// splats towards it. `off`; a number of steps; or a time, such as `20s` or `2m`. `auto`: 16 steps for two
     /// photographs, 40 for three, 75 for four, 24 for each of more, 240 at most. The steps end early where the
     /// photographs no longer improve.
     #[arg(
