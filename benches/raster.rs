@@ -418,8 +418,12 @@ fn write(folder: &Path, bench: &Bench) -> Result<()> {
         save_splats(at("ply"), &splats, &Default::default())?;
         let file = format!("{}.png", spec.name);
         let camera_only = NamedCamera::new(file, camera);
-        let cameras =
-            CameraFile { cameras: vec![camera_only], units: Units::Unknown, near_far: None };
+        let cameras = CameraFile {
+            cameras: vec![camera_only],
+            units: Units::Unknown,
+            near_far: None,
+            ..Default::default()
+        };
         save_cameras_json(at("cameras.json"), &cameras)?;
         write_tensors(&at("shared.safetensors"), &splats, &camera)?;
         write_tensors(&at("safetensors"), &scene::unshared(&splats), &camera)?;

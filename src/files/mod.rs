@@ -15,8 +15,9 @@ pub mod splats;
 pub mod weights;
 
 pub use splats::{
-    SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, encode_splats, encode_splats_with,
-    load_splats, load_with_comments, parse_splats, save_splats, splat_info,
+    SaveOptions, SaveReport, SplatFile, SplatFormat, SplatInfo, Up, encode_splats,
+    encode_splats_with, load_splat_file, load_splats, load_with_comments, parse_splats,
+    save_splats, splat_info,
 };
 
 use std::fs::File;
@@ -66,6 +67,16 @@ impl Error {
     ) -> Self {
         let (expected, got) = (expected.into(), got.into());
         Self::Format { path: path.into(), at: String::new(), expected, got }
+    }
+
+    /// The same error, for another thing that it concerns.
+    pub(crate) fn copy(&self) -> Self {
+        match self {
+            Self::Io { path, source } => Self::io(path, source.kind().into()),
+            Self::Format { path, at, expected, got } => {
+                Self::format(path, expected, got).at(at.clone())
+            }
+        }
     }
 
     /// Returns the same error at a place in the file: `:12`, ` at byte 96`, ` frame 3`.

@@ -13,6 +13,7 @@
 use super::phase::Phase;
 use super::phase_run::{Outcome, PhaseRun, run};
 use super::removal::Groups;
+use super::targets::{MaskedView, whole};
 use super::{FinishError, TargetView};
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
@@ -94,6 +95,21 @@ pub fn fit(
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
 ) -> Result<FitReport, FinishError> {
+    fit_masked(splats, &whole(views), raster, options, renderer, progress)
+}
+
+/// [`fit`] to the pixels that masks keep.
+///
+/// # Errors
+/// Those of [`fit`]; a mask of another size than its camera.
+pub(crate) fn fit_masked(
+    splats: &mut Splats,
+    views: &[MaskedView<'_>],
+    raster: &RasterOptions,
+    options: &FitOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
+) -> Result<FitReport, FinishError> {
     let phase = Phase::fit(options, has_sharper_start(splats, views));
     let mut groups = Groups::default();
     let mut step = |phase: &PhaseRun<'_>| progress(phase.steps());
@@ -106,7 +122,7 @@ pub fn fit(
 /// which the pictures have no fewer pixels. Gaussians with different numbers of siblings have an SH
 /// set each and start as predicted: new views gain 0.1 dB and lose .05 of sharpness. Where Gaussians
 /// are denser than pixels, their widths cannot be seen.
-fn has_sharper_start(splats: &Splats, views: &[TargetView<'_>]) -> bool {
-    let pixels: usize = views.iter().map(|v| v.image.width * v.image.height).sum();
+fn has_sharper_start(splats: &Splats, views: &[MaskedView<'_>]) -> bool {
+    let pixels: usize = views.iter().map(MaskedView::pixels).sum();
     splats.children_per_parent() > 1 && splats.len() <= pixels
 }

@@ -31,6 +31,8 @@ pub use refine::{RefineOptions, RefineReport, refine};
 pub use targets::TargetView;
 
 #[cfg(feature = "network")]
+pub(crate) use fit::fit_masked;
+#[cfg(feature = "network")]
 pub(crate) use phase_run::check_time;
 #[cfg(feature = "network")]
 pub(crate) use refine::refine_groups;
@@ -38,6 +40,8 @@ pub(crate) use refine::refine_groups;
 pub use removal::Groups;
 #[cfg(feature = "network")]
 pub(crate) use removal::{LEAST_SHARE, families, hidden, shares, shown};
+#[cfg(feature = "network")]
+pub(crate) use targets::MaskedView;
 
 use thiserror::Error;
 

@@ -8,7 +8,7 @@ use super::parameters::MEAN;
 use super::phase::{Measure, Phase, Photographs};
 use super::refine::RefineOptions;
 use super::removal::{Groups, pruned};
-use super::targets::{Target, TargetView, beyond, by_planes, pixel_sizes};
+use super::targets::{MaskedView, Target, TargetView, beyond, by_planes, pixel_sizes, whole};
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use std::ops::{ControlFlow, Range};
@@ -70,19 +70,19 @@ impl<'a> PhaseRun<'a> {
         options: &RefineOptions,
     ) -> Result<Self, FinishError> {
         let groups = Groups::equal(splats, views.len(), options.grouped);
-        Self::of_phase(splats, groups, views, raster, &Phase::refine(options))
+        Self::of_phase(splats, groups, &whole(views), raster, &Phase::refine(options))
     }
 
     /// Prepares a phase of `splats`, whose Gaussians of each photograph are in `groups`.
     fn of_phase(
         splats: &'a Splats,
         groups: Groups,
-        views: &[TargetView<'a>],
+        views: &[MaskedView<'a>],
         raster: &RasterOptions,
         phase: &Phase,
     ) -> Result<Self, FinishError> {
         check_time(phase.time, HAS_CLOCK)?;
-        let target = |(i, view): (usize, &TargetView<'a>)| Target::new(i, view, phase.loss);
+        let target = |(i, view): (usize, &MaskedView<'a>)| Target::new(i, view, phase.loss);
         let targets = views.iter().enumerate().map(target).collect::<Result<_, _>>()?;
         let pixels = if phase.moves(MEAN) { pixel_sizes(splats, views) } else { Vec::new() };
         let spares = phase.spares_edges && views.len() == 2;
@@ -269,7 +269,7 @@ fn gradients_of<'g>(
 pub(super) fn run(
     splats: &mut Splats,
     groups: &mut Groups,
-    views: &[TargetView<'_>],
+    views: &[MaskedView<'_>],
     raster: &RasterOptions,
     phase: &Phase,
     renderer: &mut Renderer,

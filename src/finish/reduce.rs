@@ -15,9 +15,9 @@
 //!
 //! The same input gives the same bytes on any number of threads.
 
-use super::TargetView;
 use super::merge::{Blob, CURVE_BITS, curve_code, folded};
 use super::removal::shares;
+use super::targets::MaskedView;
 use crate::scene::pictures::Rgb;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
@@ -71,8 +71,8 @@ fn picture_shares(
     // Only the sizes of the pictures count.
     let blank = |c: &Camera| Rgb::black(c.intrinsics().width, c.intrinsics().height);
     let pictures: Vec<Rgb> = cameras.iter().map(blank).collect();
-    let views: Vec<TargetView<'_>> =
-        cameras.iter().zip(&pictures).map(|(camera, image)| TargetView { camera, image }).collect();
+    let view = |(camera, image)| MaskedView { camera, image, mask: None };
+    let views: Vec<MaskedView<'_>> = cameras.iter().zip(&pictures).map(view).collect();
     let mut found = if views.is_empty() {
         vec![1.0; splats.len()]
     } else {

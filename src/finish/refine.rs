@@ -33,6 +33,7 @@
 use super::phase::Phase;
 use super::phase_run::{Outcome, PhaseRun, run};
 use super::removal::{Groups, LEAST_SHARE};
+use super::targets::{MaskedView, whole};
 use super::{FinishError, TargetView};
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
@@ -172,17 +173,18 @@ pub fn refine(
     progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport, FinishError> {
     let mut groups = Groups::equal(splats, views.len(), options.grouped);
-    refine_groups(splats, &mut groups, views, raster, options, renderer, progress)
+    refine_groups(splats, &mut groups, &whole(views), raster, options, renderer, progress)
 }
 
-/// [`refine`] with the Gaussians of each photograph in `groups`, which follow the removal.
+/// [`refine`] on the pixels that masks keep, with the Gaussians of each photograph in `groups`, which follow the
+/// removal.
 ///
 /// # Errors
-/// Those of [`refine`].
+/// Those of [`refine`]; a mask of another size than its camera.
 pub(crate) fn refine_groups(
     splats: &mut Splats,
     groups: &mut Groups,
-    views: &[TargetView<'_>],
+    views: &[MaskedView<'_>],
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,

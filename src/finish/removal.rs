@@ -1,6 +1,6 @@
 //! Gaussians by photograph, and the removal of those that the photographs hardly show.
 
-use super::TargetView;
+use super::targets::MaskedView;
 use crate::scene::render;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
@@ -28,7 +28,7 @@ pub struct Groups {
 impl Groups {
     /// Equal groups of whole families, one for each of `views` photographs. Not known where the
     /// Gaussians are not `grouped`, or where the parents do not divide into equal groups.
-    pub(super) fn equal(splats: &Splats, views: usize, grouped: bool) -> Self {
+    pub(crate) fn equal(splats: &Splats, views: usize, grouped: bool) -> Self {
         let parents = splats.parents();
         if !grouped || views == 0 || !parents.is_multiple_of(views) {
             return Self::default();
@@ -50,7 +50,7 @@ pub(crate) fn hidden(shares: &[f32], photographs: usize, least_share: f32) -> Ve
 /// Parents that are not [`hidden`], marked by true; `None` where all stay.
 pub(crate) fn shown(
     splats: &Splats,
-    views: &[TargetView<'_>],
+    views: &[MaskedView<'_>],
     raster: &RasterOptions,
     least_share: f32,
     renderer: &mut Renderer,
@@ -66,7 +66,7 @@ pub(crate) fn shown(
 pub(super) fn pruned(
     splats: &Splats,
     groups: &Groups,
-    views: &[TargetView<'_>],
+    views: &[MaskedView<'_>],
     raster: &RasterOptions,
     least_share: f32,
     renderer: &mut Renderer,
@@ -91,11 +91,11 @@ pub(super) fn pruned(
 }
 
 /// Share of each parent in the photographs: the weights T·α of its children, summed over all
-/// pixels, over those of an average parent. The sums are gradients by the colour offsets of a
+/// pixels that are not masked, over those of an average parent. The sums are gradients by the colour offsets of a
 /// loss that adds all pixels.
 pub(crate) fn shares(
     splats: &Splats,
-    views: &[TargetView<'_>],
+    views: &[MaskedView<'_>],
     raster: &RasterOptions,
     renderer: &mut Renderer,
 ) -> Vec<f32> {
@@ -108,10 +108,15 @@ pub(crate) fn shares(
     let mut gradients = Gradients { sh_limit: Some(0), ..Gradients::default() };
     for view in views {
         let count = view.image.width * view.image.height;
-        pixels += count;
+        pixels += view.pixels();
         renderer.gradients_of(&slices, view.camera, &raster, &mut gradients, &mut |planes| {
             let mut by_pixel = vec![0.0; planes.len()];
             by_pixel[..3 * count].fill(1.0 / 3.0);
+            if let Some(mask) = view.mask {
+                let kept = mask.kept().iter().cycle();
+                let masked = by_pixel[..3 * count].iter_mut().zip(kept).filter(|(_, kept)| !**kept);
+                masked.for_each(|(weight, _)| *weight = 0.0);
+            }
             by_pixel
         });
         let families = gradients.gain.par_chunks_exact(4 * children);

@@ -3,6 +3,7 @@
 use super::FinishError;
 use super::loss::{Scored, dssim, mse};
 use super::phase::LossWeights;
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use crate::scene::splats::Splats;
 use glam::{Vec2, Vec3};
@@ -19,6 +20,34 @@ pub struct TargetView<'a> {
     pub image: &'a Rgb,
 }
 
+/// A picture that the Gaussians are to give where its mask keeps it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct MaskedView<'a> {
+    pub camera: &'a Camera,
+    /// The picture, of the camera's size.
+    pub image: &'a Rgb,
+    /// Pixels of `image` that count, of its size; `None` where all do.
+    pub mask: Option<&'a Mask>,
+}
+
+impl<'a> From<TargetView<'a>> for MaskedView<'a> {
+    fn from(TargetView { camera, image }: TargetView<'a>) -> Self {
+        Self { camera, image, mask: None }
+    }
+}
+
+impl MaskedView<'_> {
+    /// Number of pixels that count.
+    pub fn pixels(&self) -> usize {
+        self.mask.map_or(self.image.width * self.image.height, Mask::count)
+    }
+}
+
+/// `views` without masks.
+pub(super) fn whole<'a>(views: &[TargetView<'a>]) -> Vec<MaskedView<'a>> {
+    views.iter().map(|view| MaskedView::from(*view)).collect()
+}
+
 /// Coverage up to which a picture of some of the Gaussians does not count; above it, the weight of a
 /// pixel grows linearly to 1.
 const COVERAGE_MIN: f32 = 0.7;
@@ -28,16 +57,20 @@ pub(super) struct Target<'a> {
     pub camera: &'a Camera,
     /// `[3, H, W]`.
     pub truth: Vec<f32>,
+    /// Pixels that count.
+    mask: Option<&'a Mask>,
     weights: LossWeights,
 }
 
 impl<'a> Target<'a> {
     /// Refuses a picture of another size than its camera. `index` names the view.
-    pub fn check(index: usize, view: &TargetView<'_>) -> Result<(), FinishError> {
+    pub fn check(index: usize, view: &MaskedView<'_>) -> Result<(), FinishError> {
         let k = view.camera.intrinsics();
-        if (k.width, k.height) != (view.image.width, view.image.height) {
-            let expected = format!("{}x{}", k.width, k.height);
-            let got = format!("{}x{}", view.image.width, view.image.height);
+        let size = (k.width, k.height);
+        let of_mask = view.mask.map(|mask| (mask.width(), mask.height()));
+        let sizes = [Some((view.image.width, view.image.height)), of_mask];
+        if let Some((w, h)) = sizes.into_iter().flatten().find(|found| *found != size) {
+            let (expected, got) = (format!("{}x{}", k.width, k.height), format!("{w}x{h}"));
             return Err(FinishError::Size { view: index, expected, got });
         }
         Ok(())
@@ -49,11 +82,12 @@ impl<'a> Target<'a> {
     /// Those of [`Target::check`].
     pub fn new(
         index: usize,
-        view: &TargetView<'a>,
+        view: &MaskedView<'a>,
         weights: LossWeights,
     ) -> Result<Self, FinishError> {
         Self::check(index, view)?;
-        Ok(Self { camera: view.camera, truth: view.image.to_planes(), weights })
+        let truth = view.image.to_planes();
+        Ok(Self { camera: view.camera, truth, mask: view.mask, weights })
     }
 
     /// The loss of rendered planes `[5, H, W]`, with its gradient by R, G and B.
@@ -61,8 +95,21 @@ impl<'a> Target<'a> {
         self.loss_to(planes, &self.truth)
     }
 
-    /// [`Target::loss`] with another `truth`.
+    /// [`Target::loss`] with another `truth`. Masked pixels have no weight: the truth is the rendered picture there,
+    /// and their gradient is 0. A window of SSIM that they share with others counts as a whole.
     fn loss_to(&self, planes: &[f32], truth: &[f32]) -> Scored {
+        let Some(mask) = self.mask else { return self.loss_of_all(planes, truth) };
+        let kept = mask.kept();
+        let masked = || (0..truth.len()).filter(|i| !kept[i % kept.len()]);
+        let mut seen = truth.to_vec();
+        masked().for_each(|i| seen[i] = planes[i]);
+        let mut loss = self.loss_of_all(planes, &seen);
+        masked().for_each(|i| loss.gradient[i] = 0.0);
+        loss.scaled(kept.len() as f64 / mask.count().max(1) as f64)
+    }
+
+    /// The loss of all pixels.
+    fn loss_of_all(&self, planes: &[f32], truth: &[f32]) -> Scored {
         let k = self.camera.intrinsics();
         let rgb = &planes[..truth.len()];
         let mut loss = mse(rgb, truth);
@@ -86,7 +133,12 @@ impl<'a> Target<'a> {
 
     /// Mean squared difference of rendered planes `[5, H, W]`.
     pub fn error(&self, planes: &[f32]) -> f64 {
-        mse(&planes[..self.truth.len()], &self.truth).value
+        let Some(mask) = self.mask else {
+            return mse(&planes[..self.truth.len()], &self.truth).value;
+        };
+        let pixels = mask.kept().iter().cycle().zip(planes.iter().zip(&self.truth));
+        let squares = pixels.filter(|(kept, _)| **kept).map(|(_, (a, b))| f64::from(a - b).powi(2));
+        squares.sum::<f64>() / (3 * mask.count()).max(1) as f64
     }
 
     /// Mean squared difference of planes `[5, H, W]` where Gaussians cover the picture, 0 where they
@@ -94,14 +146,17 @@ impl<'a> Target<'a> {
     pub fn error_where_covered(&self, planes: &[f32]) -> [f64; 2] {
         let pixels = self.truth.len() / 3;
         let (mut sum, mut weights) = (0.0, 0.0);
-        for (i, weight) in coverage_weights(planes, pixels).enumerate() {
+        let counted = self.mask.map_or(pixels, Mask::count);
+        let is_kept = |i: usize| self.mask.is_none_or(|mask| mask.kept()[i]);
+        let covered = coverage_weights(planes, pixels).enumerate().filter(|(i, _)| is_kept(*i));
+        for (i, weight) in covered {
             let elements = [i, i + pixels, i + 2 * pixels];
             let squares = elements.map(|j| f64::from(planes[j] - self.truth[j]).powi(2));
             sum += f64::from(weight) * squares.iter().sum::<f64>();
             weights += 3.0 * f64::from(weight);
         }
         let error = if weights > 0.0 { sum / weights } else { 0.0 };
-        [error, weights / (3 * pixels).max(1) as f64]
+        [error, weights / (3 * counted).max(1) as f64]
     }
 }
 
@@ -119,7 +174,7 @@ pub(super) fn by_planes(loss: Scored, planes: &[f32]) -> Vec<f32> {
 }
 
 /// Size of a pixel at each Gaussian, in the photograph where it is smallest, world units.
-pub(super) fn pixel_sizes(splats: &Splats, views: &[TargetView<'_>]) -> Vec<f32> {
+pub(super) fn pixel_sizes(splats: &Splats, views: &[MaskedView<'_>]) -> Vec<f32> {
     let size = |mean: Vec3, camera: &Camera| {
         mean.distance(camera.position()) / camera.intrinsics().fx.max(camera.intrinsics().fy)
     };
@@ -134,7 +189,7 @@ pub(super) fn pixel_sizes(splats: &Splats, views: &[TargetView<'_>]) -> Vec<f32>
 /// Marks the Gaussians that reach beyond the photographs: none of them shows all of 3σ. The part
 /// that a photograph shows would shrink and move it, and leave a black strip at the edge of new views.
 /// Of five photographs this costs 0.04 dB, because the others show such Gaussians from elsewhere.
-pub(super) fn beyond(splats: &Splats, views: &[TargetView<'_>]) -> Vec<bool> {
+pub(super) fn beyond(splats: &Splats, views: &[MaskedView<'_>]) -> Vec<bool> {
     let shown = |row: &[f32], camera: &Camera| {
         let mean = Vec3::from_slice(&row[MEAN_OFFSET..]);
         let Some(p) = camera.project(mean) else { return false };
@@ -146,4 +201,122 @@ pub(super) fn beyond(splats: &Splats, views: &[TargetView<'_>]) -> Vec<bool> {
     };
     let rows = splats.rows.par_chunks_exact(SPLAT_STRIDE);
     rows.map(|row| !views.iter().any(|v| shown(row, v.camera))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Mat4;
+    use subsplat_kernels::camera::Intrinsics;
+
+    const SIZE: [usize; 2] = [24, 18];
+
+    /// A camera, a picture and a mask of about two thirds of it.
+    fn view() -> (Camera, Rgb, Mask) {
+        let [w, h] = SIZE;
+        let camera = Camera::new(Intrinsics::from_fov_x(1.0, w, h), Mat4::IDENTITY).unwrap();
+        let value = |i: usize| (subsplat_kernels::layout::random::mix(i as u64) >> 56) as u8;
+        let image = Rgb { width: w, height: h, data: (0..3 * w * h).map(value).collect() };
+        let kept = (0..w * h).map(|i| (i % w + i / w) % 9 > 2).collect();
+        (camera, image, Mask::new(w, h, kept).unwrap())
+    }
+
+    /// Rendered planes `[5, H, W]`.
+    fn planes() -> Vec<f32> {
+        let value = |i: u64| (subsplat_kernels::layout::random::mix(i + 9000) >> 40) as f32;
+        (0..(5 * SIZE[0] * SIZE[1]) as u64).map(|i| value(i) / 2f32.powi(24)).collect()
+    }
+
+    fn target<'a>(
+        camera: &'a Camera,
+        image: &'a Rgb,
+        mask: Option<&'a Mask>,
+        dssim: f64,
+    ) -> Target<'a> {
+        let weights = LossWeights { dssim, across: 1.0 };
+        Target::new(0, &MaskedView { camera, image, mask }, weights).unwrap()
+    }
+
+    #[test]
+    fn masked_pixels_have_no_weight() {
+        let (camera, image, mask) = view();
+        let (pixels, planes) = (SIZE[0] * SIZE[1], planes());
+        let mut other_image = image.clone();
+        for (pixel, kept) in other_image.data.chunks_exact_mut(3).zip(mask.kept()) {
+            if !kept {
+                pixel.fill(7);
+            }
+        }
+        for dssim in [0.0, 0.2] {
+            let own = target(&camera, &image, Some(&mask), dssim);
+            let other = target(&camera, &other_image, Some(&mask), dssim);
+            for covered in [false, true] {
+                let loss = |target: &Target<'_>| match covered {
+                    false => target.loss(&planes),
+                    true => target.loss_where_covered(&planes),
+                };
+                let scored = loss(&own);
+                assert_eq!(scored, loss(&other), "what is masked does not matter");
+                for (i, g) in scored.gradient.iter().enumerate() {
+                    assert!(mask.kept()[i % pixels] || *g == 0.0, "{i}: {g}");
+                }
+                assert!(scored.gradient.iter().any(|g| *g != 0.0));
+            }
+        }
+        // The difference alone is the mean over the pixels that count.
+        let own = target(&camera, &image, Some(&mask), 0.0);
+        let kept = |i: usize| mask.kept()[i % pixels];
+        let difference = |i: usize| f64::from(planes[i] - own.truth[i]);
+        let mean = (0..3 * pixels).filter(|i| kept(*i)).map(|i| difference(i).powi(2)).sum::<f64>()
+            / (3 * mask.count()) as f64;
+        assert!((own.error(&planes) / mean - 1.0).abs() < 1e-9);
+        let scored = own.loss(&planes);
+        assert!((scored.value / mean - 1.0).abs() < 1e-6);
+        for i in (0..3 * pixels).filter(|i| kept(*i)) {
+            let slope = 2.0 * difference(i) / (3 * mask.count()) as f64;
+            assert!((f64::from(scored.gradient[i]) - slope).abs() < 1e-7);
+        }
+    }
+
+    /// The gradient of kept pixels is the derivative of the loss in which the truth of masked ones stays.
+    #[test]
+    fn gradients_of_kept_pixels_are_derivatives() {
+        let (camera, image, mask) = view();
+        let own = target(&camera, &image, Some(&mask), 0.2);
+        let (pixels, planes) = (SIZE[0] * SIZE[1], planes());
+        let scored = own.loss(&planes);
+        for i in (0..3 * pixels).step_by(37).filter(|i| mask.kept()[i % pixels]) {
+            let at = |step: f32| {
+                let mut moved = planes.clone();
+                moved[i] += step;
+                own.loss(&moved).value
+            };
+            let slope = (at(4e-3) - at(-4e-3)) / 8e-3;
+            let got = f64::from(scored.gradient[i]);
+            assert!((got - slope).abs() < 2e-2 * slope.abs().max(5e-4), "{i}: {got} {slope}");
+        }
+    }
+
+    #[test]
+    fn errors_count_kept_pixels_alone() {
+        let (camera, image, mask) = view();
+        let pixels = SIZE[0] * SIZE[1];
+        let mut planes = planes();
+        planes[3 * pixels..4 * pixels].fill(1.0);
+        let masked = target(&camera, &image, Some(&mask), 0.0);
+        let [error, covered] = masked.error_where_covered(&planes);
+        assert!((error / masked.error(&planes) - 1.0).abs() < 1e-6 && (covered - 1.0).abs() < 1e-6);
+        // A mask that keeps all changes nothing.
+        let all = Mask::new(SIZE[0], SIZE[1], vec![true; pixels]).unwrap();
+        let (whole, all) =
+            (target(&camera, &image, None, 0.2), target(&camera, &image, Some(&all), 0.2));
+        assert_eq!(whole.loss(&planes), all.loss(&planes));
+        assert_eq!(whole.error_where_covered(&planes), all.error_where_covered(&planes));
+        assert!((whole.error(&planes) / all.error(&planes) - 1.0).abs() < 1e-9);
+        // Another size is an error.
+        let small = Mask::new(2, 2, vec![true; 4]).unwrap();
+        let view = MaskedView { camera: &camera, image: &image, mask: Some(&small) };
+        let error = Target::check(3, &view).unwrap_err().to_string();
+        assert_eq!(error, "view 3: expected a picture of 24x18, got 2x2");
+    }
 }

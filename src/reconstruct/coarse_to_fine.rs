@@ -19,7 +19,10 @@ use super::children::GAIN_WITH_OFFSETS;
 use super::{Error, Result, finishing};
 use crate::cameras::dense::{DenseMatch, DenseView, match_depth};
 use crate::cameras::matches::GrayImage;
-use crate::finish::{FitOptions, PhaseRun, RefineOptions, families, fit, refine, shown};
+use crate::finish::{
+    FitOptions, Groups, MaskedView, PhaseRun, RefineOptions, families, fit_masked, refine_groups,
+    shown,
+};
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::reconstruct::inputs::pair::choose_sources;
 use crate::scene::render::Renderer;
@@ -62,10 +65,8 @@ pub fn match_parents(
     if parents.len() != pixels {
         return Ok(Vec::new());
     }
-    let pictures: Option<Vec<GrayImage>> = inputs
-        .iter()
-        .map(|c| GrayImage::from_rgb8(c.input.width, c.input.height, &c.input.data))
-        .collect();
+    let grey = |c: &Cropped| GrayImage::from_picture(&c.input, c.input_mask.as_ref());
+    let pictures: Option<Vec<GrayImage>> = inputs.iter().map(grey).collect();
     let Some(pictures) = pictures else { return Ok(Vec::new()) };
     let cameras: Vec<Camera> = inputs.iter().map(|c| c.input_camera).collect();
     let sources = choose_sources(&cameras, near_far, SOURCES);
@@ -114,8 +115,8 @@ pub fn options_of_parents(scene: &RefineOptions, inputs: &[Cropped]) -> Option<R
 }
 
 /// Fits and refines `parents` on the photographs of the input's size, which `raster` renders, by
-/// [`options_of_parents`]. Those that the photographs hardly show become transparent instead, and
-/// get no children. `progress` receives the share that is done.
+/// [`options_of_parents`]. Those that the photographs hardly show, and those of masked pixels, become transparent
+/// instead, and get no children. `progress` receives the share that is done.
 ///
 /// # Errors
 /// [`Error::Cancelled`].
@@ -128,14 +129,44 @@ pub fn refine_parents(
     progress: &mut dyn FnMut(f32) -> ControlFlow<()>,
 ) -> Result<()> {
     let views = finishing::input_views(inputs);
-    let keep = shown(parents, &views, raster, PARENTS_SHARE, renderer);
+    let per_view = parents.len() / inputs.len().max(1);
+    let Some(unmasked) = finishing::kept_parents(inputs, per_view) else {
+        let groups = Groups::equal(parents, views.len(), options.grouped);
+        return refine_shown(parents, groups, &views, raster, options, renderer, progress);
+    };
+    let mut own = families(parents, &unmasked);
+    let groups = match options.grouped {
+        true => finishing::groups_of(&unmasked, per_view, 1),
+        false => Groups::default(),
+    };
+    refine_shown(&mut own, groups, &views, raster, options, renderer, progress)?;
+    restore(parents, &unmasked, &own);
+    Ok(())
+}
+
+/// Fits and refines those of `parents` that the photographs show; the others become transparent. `groups` are the
+/// parents of each photograph.
+fn refine_shown(
+    parents: &mut Splats,
+    mut groups: Groups,
+    views: &[MaskedView<'_>],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(f32) -> ControlFlow<()>,
+) -> Result<()> {
+    let keep = shown(parents, views, raster, PARENTS_SHARE, renderer);
     let mut kept = keep.as_ref().map(|keep| families(parents, keep));
+    if let Some(kept) = &kept {
+        groups = Groups::equal(kept, views.len(), options.grouped);
+    }
     let moved = kept.as_mut().unwrap_or(parents);
     let mut step = |_: usize| progress(0.0);
     let sizes = FitOptions::default();
-    fit(moved, &views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;
+    fit_masked(moved, views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;
     let mut step = |phase: &PhaseRun<'_>| progress(phase.progress());
-    refine(moved, &views, raster, options, renderer, &mut step).map_err(finishing::error)?;
+    refine_groups(moved, &mut groups, views, raster, options, renderer, &mut step)
+        .map_err(finishing::error)?;
     if let (Some(keep), Some(kept)) = (keep, kept) {
         restore(parents, &keep, &kept);
     }

@@ -110,7 +110,8 @@ pub fn estimate_cameras(
     for photograph in &photographs {
         let (lens, source) = lens(photograph, options.lens);
         lenses.push(source);
-        pose_photos.push(PosePhoto::from_rgb8(&photograph.image.data, lens, features)?);
+        let Photograph { image, mask, .. } = photograph;
+        pose_photos.push(PosePhoto::from_picture(image, mask.as_ref(), lens, features)?);
     }
     let estimate = estimate_poses(&pose_photos, &options.poses).map_err(|reason| {
         Error::NoPoses { photographs: format!("{} photographs", photographs.len()), reason }
@@ -118,7 +119,13 @@ pub fn estimate_cameras(
     let photos = photographs
         .into_iter()
         .zip(&estimate.cameras)
-        .filter_map(|(photograph, camera)| Some(Photo::new(photograph.image, (*camera)?)))
+        .filter_map(|(photograph, camera)| {
+            let photo = Photo::new(photograph.image, (*camera)?);
+            Some(match photograph.mask {
+                Some(mask) => photo.and_then(|photo| photo.with_mask(mask)),
+                None => photo,
+            })
+        })
         .collect::<Result<_>>()?;
     Ok(EstimatedPhotos { photos, estimate, lenses })
 }
@@ -156,8 +163,8 @@ fn estimate_scene(
         warnings.extend(loaded.warnings.iter().cloned());
         let (lens, source) = lens(&loaded, options.lens);
         lenses.push(source);
-        let image = loaded.image;
-        photos.push(PosePhoto::from_rgb8(&image.data, lens, features)?);
+        let Photograph { image, mask, .. } = loaded;
+        photos.push(PosePhoto::from_picture(&image, mask.as_ref(), lens, features)?);
     }
     let estimate = estimate_poses(&photos, &options.poses).map_err(|reason| Error::NoPoses {
         photographs: photographs_of(name, photographs),
@@ -179,10 +186,8 @@ fn estimate_scene(
         }
     }
     scene.warnings.extend(warnings);
-    for left in &estimate.left_out {
-        let path = photographs[left.photo].display();
-        scene.warnings.push(format!("{path} is left out: {}", left.reason));
-    }
+    let file = |photo: usize| photographs[photo].display().to_string();
+    scene.warnings.extend(estimate.left_out_sentences(file));
     scene.warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
     Ok(EstimatedScene { scene, estimate, lenses })
 }

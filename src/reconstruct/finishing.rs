@@ -2,10 +2,11 @@
 
 use super::{Error, Refine, Result};
 use crate::finish::{
-    FinishError, FitOptions, FitReport, Groups, PhaseRun, RefineOptions, RefineReport, TargetView,
-    check_time, fit, refine_groups,
+    FinishError, FitOptions, FitReport, Groups, MaskedView, PhaseRun, RefineOptions, RefineReport,
+    check_time, fit_masked, refine_groups,
 };
 use crate::reconstruct::inputs::crop::Cropped;
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
@@ -19,6 +20,7 @@ use subsplat_kernels::layout::RasterOptions;
 struct SharpPicture<'a> {
     camera: Camera,
     image: Cow<'a, Rgb>,
+    mask: Option<Cow<'a, Mask>>,
 }
 
 impl<'a> SharpPicture<'a> {
@@ -27,7 +29,11 @@ impl<'a> SharpPicture<'a> {
     fn new(c: &'a Cropped) -> Self {
         let scale = c.window.scale.min_element();
         if !(scale < 1.0) {
-            return Self { camera: c.target_camera, image: Cow::Borrowed(&c.target) };
+            return Self {
+                camera: c.target_camera,
+                image: Cow::Borrowed(&c.target),
+                mask: c.target_mask.as_ref().map(Cow::Borrowed),
+            };
         }
         let side = |side: usize| (side as f32 * scale).round() as usize;
         let size = Size::new(side(c.target.width), side(c.target.height));
@@ -35,13 +41,18 @@ impl<'a> SharpPicture<'a> {
             && size.height > c.input.height
             && let Ok((image, camera)) = c.resized(size)
         {
-            return Self { camera, image: Cow::Owned(image) };
+            let mask = c.resized_mask(size).map(Cow::Owned);
+            return Self { camera, image: Cow::Owned(image), mask };
         }
-        Self { camera: c.input_camera, image: Cow::Borrowed(&c.input) }
+        Self {
+            camera: c.input_camera,
+            image: Cow::Borrowed(&c.input),
+            mask: c.input_mask.as_ref().map(Cow::Borrowed),
+        }
     }
 
-    fn view(&self) -> TargetView<'_> {
-        TargetView { camera: &self.camera, image: &self.image }
+    fn view(&self) -> MaskedView<'_> {
+        MaskedView { camera: &self.camera, image: &self.image, mask: self.mask.as_deref() }
     }
 }
 
@@ -59,7 +70,7 @@ pub fn fit_to_inputs(
     progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
 ) -> Result<FitReport> {
     let pictures = sharp_pictures(inputs);
-    fit(splats, &views_of(&pictures), raster, options, renderer, progress).map_err(error)
+    fit_masked(splats, &views_of(&pictures), raster, options, renderer, progress).map_err(error)
 }
 
 /// Refines the Gaussians of `inputs`, those of each photograph in `groups`, on their photographs.
@@ -90,15 +101,52 @@ pub(crate) fn check_refine(refine: Refine) -> Result<()> {
 }
 
 /// The photographs of the input's size.
-pub(super) fn input_views(inputs: &[Cropped]) -> Vec<TargetView<'_>> {
-    inputs.iter().map(|c| TargetView { camera: &c.input_camera, image: &c.input }).collect()
+pub(super) fn input_views(inputs: &[Cropped]) -> Vec<MaskedView<'_>> {
+    let views = inputs.iter().map(|c| MaskedView {
+        camera: &c.input_camera,
+        image: &c.input,
+        mask: c.input_mask.as_ref(),
+    });
+    views.collect()
+}
+
+/// Marks the parents, `per_view` of each photograph in the order of its pixels, whose pixels count; `None` where
+/// all do.
+pub(super) fn kept_parents(inputs: &[Cropped], per_view: usize) -> Option<Vec<bool>> {
+    inputs.iter().any(|c| c.input_mask.is_some()).then(|| {
+        let mut kept = Vec::with_capacity(inputs.len() * per_view);
+        for c in inputs {
+            let pixels = (c.input.width * c.input.height).max(1);
+            // MVSplat may give a pixel several Gaussians.
+            let per_pixel = (per_view / pixels).max(1);
+            let mark = |i: usize| {
+                let mask = c.input_mask.as_ref();
+                mask.is_none_or(|mask| mask.kept().get(i / per_pixel) != Some(&false))
+            };
+            kept.extend((0..per_view).map(mark));
+        }
+        kept
+    })
+}
+
+/// The Gaussians of each photograph where `kept` marks the parents, `per_view` of each photograph, that have
+/// `children` Gaussians each.
+pub(super) fn groups_of(kept: &[bool], per_view: usize, children: usize) -> Groups {
+    let mut end = 0;
+    let range = |view: &[bool]| {
+        let begin = end;
+        end += children * view.iter().filter(|kept| **kept).count();
+        begin..end
+    };
+    let ranges = kept.chunks(per_view.max(1)).map(range).collect();
+    Groups { ranges, equal_families: true }
 }
 
 fn sharp_pictures(inputs: &[Cropped]) -> Vec<SharpPicture<'_>> {
     inputs.iter().map(SharpPicture::new).collect()
 }
 
-fn views_of<'a>(pictures: &'a [SharpPicture<'_>]) -> Vec<TargetView<'a>> {
+fn views_of<'a>(pictures: &'a [SharpPicture<'_>]) -> Vec<MaskedView<'a>> {
     pictures.iter().map(SharpPicture::view).collect()
 }
 

@@ -56,6 +56,7 @@ mod prepared;
 mod progress;
 mod reconstruction;
 mod reconstructor;
+mod unit;
 mod warning;
 
 pub use crate::network::model::Backend;

@@ -4,7 +4,8 @@ use super::{Error, Result};
 use crate::files::photos::image::LoadOptions;
 use crate::files::photos::photograph::Photograph;
 use crate::files::poses::scene::{Frame, LoadedFrame};
-use crate::reconstruct::inputs::crop::{CropOptions, Cropped, crop};
+use crate::reconstruct::inputs::crop::{CropOptions, Cropped, crop_masked};
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use std::sync::Arc;
 use subsplat_kernels::camera::{Camera, Size};
@@ -13,6 +14,8 @@ use subsplat_kernels::camera::{Camera, Size};
 #[derive(Clone, Debug, PartialEq)]
 pub struct Photo {
     image: Arc<Rgb>,
+    /// Pixels that count, of the picture's size.
+    mask: Option<Arc<Mask>>,
     camera: Camera,
 }
 
@@ -35,7 +38,25 @@ impl Photo {
             let got = format!("one of {}x{}", k.width, k.height);
             return Err(Error::argument("photograph", expected, got));
         }
-        Ok(Self { image: Arc::new(image), camera })
+        Ok(Self { image: Arc::new(image), mask: None, camera })
+    }
+
+    /// The same photograph with a mask. Masked pixels make no Gaussians and have no weight in the optimisation, and
+    /// no points are matched there.
+    ///
+    /// # Errors
+    /// A mask of another size than the photograph's, or that keeps no pixel.
+    pub fn with_mask(self, mask: Mask) -> Result<Self> {
+        let expected =
+            format!("one of {}x{} that keeps pixels", self.image.width, self.image.height);
+        if !mask.fits(&self.image) {
+            let got = format!("one of {}x{}", mask.width(), mask.height());
+            return Err(Error::argument("mask", expected, got));
+        }
+        if mask.keeps_none() {
+            return Err(Error::argument("mask", expected, "one that keeps none"));
+        }
+        Ok(Self { mask: (!mask.keeps_all()).then(|| Arc::new(mask)), ..self })
     }
 
     /// Decodes a frame's picture and removes its lens distortion.
@@ -51,8 +72,8 @@ impl Photo {
     /// # Errors
     /// Those of [`Frame::load_with`].
     pub fn from_frame_with(frame: &Frame, options: &LoadOptions) -> Result<Self> {
-        let LoadedFrame { picture, camera, .. } = frame.load_with(options)?;
-        Ok(Self { image: Arc::new(picture), camera })
+        let LoadedFrame { picture, mask, camera, .. } = frame.load_with(options)?;
+        Ok(Self { image: Arc::new(picture), mask: mask.map(Arc::new), camera })
     }
 
     /// The same pixels with the pose of another camera; the intrinsics stay.
@@ -66,7 +87,7 @@ impl Photo {
     /// The same pixels with another camera of their size.
     pub fn with_camera(&self, camera: Camera) -> Result<Self> {
         let camera = Camera::new(camera.intrinsics(), camera.world_from_camera())?;
-        Ok(Self { image: Arc::clone(&self.image), camera })
+        Ok(Self { image: Arc::clone(&self.image), mask: self.mask.clone(), camera })
     }
 
     /// The size.
@@ -79,6 +100,11 @@ impl Photo {
         &self.image
     }
 
+    /// Pixels that count; `None` where all do.
+    pub fn mask(&self) -> Option<&Mask> {
+        self.mask.as_deref()
+    }
+
     /// Pinhole camera of these pixels.
     pub fn camera(&self) -> &Camera {
         &self.camera
@@ -87,9 +113,9 @@ impl Photo {
     /// Crops and resizes the photograph to the network's input and to the target picture.
     ///
     /// # Errors
-    /// Those of [`crop`].
+    /// Those of [`crop_masked`].
     pub fn crop(&self, options: &CropOptions) -> Result<Cropped> {
-        Ok(crop(&self.image, &self.camera, options)?)
+        Ok(crop_masked(&self.image, self.mask(), &self.camera, options)?)
     }
 }
 

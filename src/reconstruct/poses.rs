@@ -86,7 +86,7 @@ pub fn located(photos: &[Photo], others: &[Photo]) -> Result<Vec<Option<Camera>>
 fn features(photos: &[Photo]) -> Result<Vec<PosePhoto>> {
     let of = |p: &Photo| {
         let lens = Lens::known(p.camera().intrinsics());
-        PosePhoto::from_rgb8(&p.image().data, lens, FEATURES)
+        PosePhoto::from_picture(p.image(), p.mask(), lens, FEATURES)
     };
     Ok(photos.par_iter().map(of).collect::<std::result::Result<_, _>>()?)
 }
@@ -96,8 +96,8 @@ fn cameras(photos: &[Photo]) -> Vec<Camera> {
 }
 
 fn grey(photo: &Photo) -> Result<GrayImage> {
-    let Rgb { width, height, data } = photo.image();
-    GrayImage::from_rgb8(*width, *height, data).ok_or_else(|| {
+    let picture @ Rgb { width, height, data } = photo.image();
+    GrayImage::from_picture(picture, photo.mask()).ok_or_else(|| {
         let expected = format!("{width}x{height} pixels");
         Error::argument("photograph", expected, data.len().to_string())
     })

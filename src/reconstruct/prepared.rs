@@ -1,6 +1,7 @@
 //! Photographs that are cropped and checked, and the network's run on them.
 
 use super::progress::Tracker;
+use super::unit;
 use super::{
     DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, SceneChildren,
     Stage, Warning, counts_of, fit_to_inputs, match_parents, options_of_parents, refine_on_inputs,
@@ -11,7 +12,8 @@ use crate::cameras::estimation::PoseAdjustment;
 use crate::finish::PhaseRun;
 use crate::network::model::Views;
 use crate::reconstruct::inputs::crop::Cropped;
-use crate::scene::pictures::{Depth, Rgb};
+use crate::scene::mask::Mask;
+use crate::scene::pictures::Depth;
 use crate::scene::render::Renderer;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::Camera;
@@ -82,19 +84,23 @@ impl Prepared<'_> {
         self,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Reconstruction> {
-        let Self { model, options, inputs, adjustment, cut_shares, bounds, reports, .. } = self;
+        let Self { model, options, mut inputs, adjustment, cut_shares, bounds, reports, .. } = self;
         let (mut warnings, mut tracker) = (self.warnings, self.tracker);
         if model.estimates_depth_range(&options) {
             tracker.begin(Stage::DepthRange, progress)?;
         }
         let initial_bounds = bounds.clone();
+        let unit = unit::unit_of(bounds.near);
+        unit::scale_cameras(&mut inputs, 1.0 / unit)?;
+        let bounds = unit::scaled(bounds, 1.0 / unit);
+        let depth_range = unit::scaled_range(options.depth_range, 1.0 / unit);
         let network = model.model();
         let estimate = |views: &Views| {
             tracker.run_steps(RANGE_STEPS, progress, |step| {
                 network.estimate_depth_range_with(views, step)
             })
         };
-        let (views, bounds) = model.views_with(&inputs, bounds, options.depth_range, estimate)?;
+        let (views, bounds) = model.views_with(&inputs, bounds, depth_range, estimate)?;
         tracker.begin(Stage::Backbone, progress)?;
         let steps = network.encode_steps(inputs.len());
         let features =
@@ -102,7 +108,7 @@ impl Prepared<'_> {
         tracker.begin(Stage::Primaries, progress)?;
         let mut encoding = network.place(features)?;
         let config = model.config();
-        let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
+        let colour = Cropped::mean_colour(&inputs);
         let raster_at = |ratio: f32| config.raster_options(ratio, bounds.near, colour);
         let mut renderer = Renderer::new(model.backend());
         let density = options.density;
@@ -149,7 +155,7 @@ impl Prepared<'_> {
         }
         let parent_counts = children.counts().to_vec();
         let SceneChildren { mut splats, mut groups, distances, .. } = children;
-        let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
+        let mut raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
         let fit_options = &options.fit;
         let mut refine_options = options.refine_options(inputs.len());
@@ -179,7 +185,19 @@ impl Prepared<'_> {
         }
         warnings.extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
         let depths = inputs.iter().zip(distances);
-        let depths = depths.map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
+        let mut depths: Vec<Depth> =
+            depths.map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
+        for (depth, c) in depths.iter_mut().zip(&inputs) {
+            let kept = c.input_mask.iter().flat_map(Mask::kept);
+            depth.data.iter_mut().zip(kept).filter(|(_, kept)| !**kept).for_each(|(z, _)| *z = 0.0);
+        }
+        if unit != 1.0 {
+            unit::scale_splats(&mut splats, unit);
+            depths.iter_mut().flat_map(|depth| &mut depth.data).for_each(|z| *z *= unit);
+            raster_options.near *= unit;
+        }
+        unit::scale_cameras(&mut inputs, unit)?;
+        let bounds = unit::scaled(bounds, unit);
         warnings.extend(Warning::of_bounds(&bounds));
         warnings.extend(model.backend_warning());
         Ok(Reconstruction {

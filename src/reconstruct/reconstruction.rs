@@ -119,7 +119,7 @@ impl Reconstruction {
         &self.cut_shares
     }
 
-    /// Predicted depth of each input, camera z, world units.
+    /// Predicted depth of each input, camera z, world units; 0 at masked pixels.
     pub fn depths(&self) -> &[Depth] {
         &self.depths
     }

@@ -3,6 +3,7 @@
 use super::{DepthBounds, Photo};
 use crate::cameras::check::{Finding, PairReport};
 use crate::reconstruct::inputs::crop::{CropOptions, Cropped};
+use std::collections::BTreeSet;
 use std::fmt;
 use subsplat_kernels::camera::Size;
 
@@ -141,8 +142,8 @@ impl fmt::Display for Warning {
 }
 
 impl Warning {
-    /// The warnings as sentences for a person: each sentence once, and one for the corrections of exposure of
-    /// three photographs or more.
+    /// The warnings as sentences for a person: each sentence once, one for the corrections of exposure of
+    /// three photographs or more, and one for the findings of a kind of three pairs or more.
     pub fn sentences(warnings: &[Self]) -> Vec<String> {
         let exposure = |w: &&Self| matches!(w, Self::ExposureCorrected { .. });
         let corrected = warnings.iter().filter(exposure).count();
@@ -153,6 +154,7 @@ impl Warning {
                     "brightness and colours of {corrected} photographs are matched to those of \
                      photograph {reference} (counted from 0)"
                 ),
+                Self::Poses { finding, .. } => of_pairs(warnings, finding),
                 _ => warning.to_string(),
             };
             if !sentences.contains(&sentence) {
@@ -217,9 +219,59 @@ impl Warning {
     }
 }
 
+/// The sentence of `finding`. Where three pairs or more of `warnings` have a finding of its kind, in
+/// different words or numbers: the sentence of the first of them, with the number of pairs.
+fn of_pairs(warnings: &[Warning], finding: &Finding) -> String {
+    let alike = |w: &Warning| match w {
+        Warning::Poses { first, finding: f } if f.code == finding.code => {
+            Some((*first, f.sentence.clone()))
+        }
+        _ => None,
+    };
+    let found: Vec<(usize, String)> = warnings.iter().filter_map(alike).collect();
+    let pairs: BTreeSet<usize> = found.iter().map(|f| f.0).collect();
+    let differ = found.iter().any(|f| f.1 != finding.sentence);
+    match (found.first(), pairs.len()) {
+        (Some((first, sentence)), 3..) if differ => format!(
+            "{sentence} (found in {} pairs of photographs; the numbers are those of photographs \
+             {first} and {}, counted from 0)",
+            pairs.len(),
+            first + 1
+        ),
+        _ => finding.sentence.clone(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cameras::check::Verdict;
+
+    #[test]
+    fn equal_findings_of_many_pairs_are_one_sentence() {
+        let pair = |first: usize, code: &str, number: usize| Warning::Poses {
+            first,
+            finding: Finding {
+                severity: Verdict::Warning,
+                code: code.to_owned(),
+                sentence: format!("{code}: {number} px"),
+            },
+        };
+        let near = |first| pair(first, "small_baseline", first);
+        let other = pair(4, "brightness", 1);
+        let many = Warning::sentences(&[near(4), other.clone(), near(5), near(8)]);
+        let joined = "small_baseline: 4 px (found in 3 pairs of photographs; the numbers are those \
+                      of photographs 4 and 5, counted from 0)";
+        assert_eq!(many, [joined, "brightness: 1 px"]);
+        // Two pairs, and two findings of one pair, keep their numbers.
+        let two = Warning::sentences(&[near(4), pair(5, "small_baseline", 7), other, near(5)]);
+        let apart = ["small_baseline: 4 px", "small_baseline: 7 px", "brightness: 1 px"];
+        assert_eq!(two[..3], apart);
+        assert_eq!(two[3..], ["small_baseline: 5 px"]);
+        // Sentences without any difference need no number.
+        let equal = [0, 1, 2].map(|first| pair(first, "same_photograph", 0));
+        assert_eq!(Warning::sentences(&equal), ["same_photograph: 0 px"]);
+    }
 
     #[test]
     fn many_corrections_of_exposure_are_one_sentence() {

@@ -1,6 +1,7 @@
 //! Scenes of Gaussians, their pictures and their measures.
 
 pub mod levels;
+pub mod mask;
 pub mod metrics;
 pub mod navigation;
 pub mod pictures;

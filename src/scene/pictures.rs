@@ -3,6 +3,8 @@
 //! 8 bits, because the evaluation protocol resizes uint8 (MVSplat, with PIL). The network reads
 //! `[3, H, W]` floats in [0, 1]. [`crate::files::photos::image`] reads and writes files.
 
+use super::mask::Mask;
+
 /// An 8-bit RGB picture.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rgb {
@@ -22,13 +24,26 @@ impl Rgb {
 
     /// Computes the mean of the mean colours of `pictures`, value / 255; black for none.
     pub fn mean_colour<'a>(pictures: impl IntoIterator<Item = &'a Self>) -> [f32; 3] {
+        Self::mean_colour_of_kept(pictures.into_iter().map(|picture| (picture, None)))
+    }
+
+    /// [`Rgb::mean_colour`] of the pixels that the masks of the pictures keep. A mask of another size is
+    /// ignored.
+    pub fn mean_colour_of_kept<'a>(
+        pictures: impl IntoIterator<Item = (&'a Self, Option<&'a Mask>)>,
+    ) -> [f32; 3] {
         let (mut sum, mut count) = ([0f64; 3], 0u32);
-        for picture in pictures {
+        for (picture, mask) in pictures {
             let mut own = [0u64; 3];
+            let mask = mask.filter(|mask| mask.fits(picture));
+            let mut kept = mask.map(|mask| mask.kept().iter());
             for px in picture.data.chunks_exact(3) {
-                own.iter_mut().zip(px).for_each(|(sum, v)| *sum += u64::from(*v));
+                if kept.as_mut().and_then(Iterator::next) != Some(&false) {
+                    own.iter_mut().zip(px).for_each(|(sum, v)| *sum += u64::from(*v));
+                }
             }
-            let pixels = (255 * (picture.data.len() / 3).max(1)) as f64;
+            let number = mask.map_or(picture.data.len() / 3, Mask::count);
+            let pixels = (255 * number.max(1)) as f64;
             sum.iter_mut().zip(own).for_each(|(sum, v)| *sum += v as f64 / pixels);
             count += 1;
         }

@@ -5,8 +5,8 @@ mod device;
 mod image;
 
 pub use comment::{
-    camera_of_comments, comment_of_camera, comment_of_options, comments_without_camera,
-    options_of_comments,
+    camera_of_comments, comment_of_camera, comment_of_options, comment_of_origin,
+    comments_without_camera, options_of_comments, origin_of_comments,
 };
 pub use device::{DeviceError, Renderer};
 

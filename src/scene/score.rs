@@ -1,5 +1,6 @@
 //! Scores of pictures and figures of Gaussians, and their means.
 
+use super::mask::Mask;
 use super::metrics::{MetricsError, gmsd, mean_gradient, psnr, ssim};
 use super::splats::SplatStatistics;
 use crate::scene::pictures::Rgb;
@@ -37,6 +38,25 @@ impl Score {
             sharpness: (theirs > 0.0).then(|| own / theirs),
             gmsd: gmsd(picture, &truth, w, h)?,
         })
+    }
+
+    /// [`Score::of`] where `mask`, of the photograph's size, keeps it: PSNR of the pixels that count. Masked pixels
+    /// count as equal for the figures that compare surroundings.
+    ///
+    /// # Errors
+    /// Those of [`Score::of`]; no pixel that counts.
+    pub fn of_kept(
+        picture: &[f32],
+        truth: &Rgb,
+        mask: Option<&Mask>,
+    ) -> Result<Self, MetricsError> {
+        let Some(mask) = mask.filter(|mask| mask.fits(truth)) else {
+            return Self::of(picture, truth);
+        };
+        let unit = truth.to_unit();
+        let (own, theirs) = (mask.kept_of(picture), mask.kept_of(&unit));
+        let psnr = psnr(&own, &theirs, own.len() / 3, 1)?;
+        Ok(Self { psnr, ..Self::of(&mask.merged(picture, &unit), truth)? })
     }
 
     /// Averages each figure; an optional one over the scores that have it.

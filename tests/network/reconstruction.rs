@@ -9,11 +9,11 @@ use subsplat::cameras::check::Verdict;
 use subsplat::network::config::{Config, Preset};
 use subsplat::network::model::Views;
 use subsplat::network::model::weights::Weights;
-use subsplat::reconstruct::DepthSource;
+use subsplat::reconstruct::{DepthRange, DepthSource, Refine};
 use subsplat::{
     Check, Detail, Error, NearFar, Options, Photo, Progress, Reconstructor, Stage, Warning,
 };
-use subsplat_kernels::camera::Size;
+use subsplat_kernels::camera::{Camera, Size};
 
 fn photos() -> Vec<Photo> {
     whole::shoot(3, 2, 160, 144).photos
@@ -177,6 +177,44 @@ fn bad_poses_are_warnings_or_an_error() {
     assert_eq!(unchecked.stage_times()[1].stage, Stage::DepthRange);
     let error = model.run(&photos[..1], &quick()).unwrap_err().to_string();
     assert_eq!(error, "photographs: expected at least 2, got 1");
+}
+
+/// A scene in a unit a million times as large is the same scene, bit for bit: both units are powers of two.
+#[test]
+fn the_unit_of_length_does_not_matter() {
+    const UNIT: f32 = 1.0 / (1 << 20) as f32;
+    let (model, photos) = (untrained(), photos());
+    let tiny: Vec<Photo> = photos
+        .iter()
+        .map(|photo| {
+            let mut pose = photo.camera().world_from_camera();
+            pose.w_axis = (pose.w_axis.truncate() * UNIT).extend(1.0);
+            let camera = Camera::new(photo.camera().intrinsics(), pose).unwrap();
+            Photo::new(photo.image().clone(), camera).unwrap()
+        })
+        .collect();
+    let run = |photos: &[Photo], unit: f32| {
+        let range = DepthRange::Fixed { near: unit, far: 8.0 * unit };
+        let options = quick().with_check(Check::Off).with_depth_range(range);
+        model.run(photos, &options.with_refine(Refine::Steps(2))).unwrap()
+    };
+    let (whole, small) = (run(&photos, 1.0), run(&tiny, UNIT));
+    assert_eq!(small.raster_options().near, whole.raster_options().near * UNIT);
+    assert_eq!(small.depth_range().near, UNIT);
+    for (a, b) in whole.splats().rows().chunks(11).zip(small.splats().rows().chunks(11)) {
+        for (i, (a, b)) in a.iter().zip(b).enumerate() {
+            let is_length = i < 3 || (7..10).contains(&i);
+            let expected = if is_length { a * UNIT } else { *a };
+            assert_eq!(*b, expected, "number {i}");
+        }
+    }
+    assert_eq!(whole.splats().sh(), small.splats().sh());
+    for (a, b) in whole.inputs().iter().zip(small.inputs()) {
+        assert_eq!(a.target_camera.position() * UNIT, b.target_camera.position());
+    }
+    for (a, b) in whole.depths().iter().zip(small.depths()) {
+        assert!(a.data.iter().zip(&b.data).all(|(a, b)| a * UNIT == *b));
+    }
 }
 
 /// Photographs keep their shape and are never stretched; the cut share is the truth.

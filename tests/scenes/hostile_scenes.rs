@@ -11,8 +11,8 @@ use std::path::Path;
 use subsplat::files::photos::image;
 use subsplat::files::poses::cameras_json::{CameraFile, save_cameras_json};
 use subsplat::files::poses::colmap::{
-    parse_cameras_bin, parse_cameras_txt, parse_images_bin, parse_images_txt, parse_points_bin,
-    parse_points_txt,
+    Cameras, ColmapImage, parse_cameras_bin, parse_cameras_txt, parse_images_bin, parse_images_txt,
+    parse_points_bin, parse_points_txt,
 };
 use subsplat::files::poses::protocol::{load_index, load_protocol};
 use subsplat::files::poses::re10k;
@@ -33,13 +33,22 @@ fn check(case: &str, result: Result<(), subsplat::files::Error>, words: &[&str])
     }
 }
 
+/// Loads a scene. An entry that is left out counts as an error with the text of its warning.
+fn load(path: &Path) -> Result<(), subsplat::files::Error> {
+    let scene = load_scene(path)?;
+    match scene.warnings.iter().find(|line| line.contains("are left out")) {
+        Some(line) => Err(subsplat::files::Error::format(path, "all entries", line)),
+        None => Ok(()),
+    }
+}
+
 /// Loads a valid scene with `file` replaced by `bytes`.
 fn with(file: &str, bytes: &[u8]) -> Result<(), subsplat::files::Error> {
     let (folder, _) = made_up(3);
     let path = folder.path().join(file);
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     std::fs::write(&path, bytes).unwrap();
-    load_scene(folder.path()).map(|_| ())
+    load(folder.path())
 }
 
 /// Returns a valid `transforms.json` of the synthetic pictures, modified by `change`.
@@ -56,8 +65,11 @@ fn transforms(change: impl Fn(&mut Value)) -> Vec<u8> {
 fn cameras_json(change: impl Fn(&mut Value)) -> Vec<u8> {
     let (folder, cameras) = made_up(3);
     let path = folder.path().join("cameras.json");
-    save_cameras_json(&path, &CameraFile { cameras, units: Units::Unknown, near_far: None })
-        .unwrap();
+    save_cameras_json(
+        &path,
+        &CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() },
+    )
+    .unwrap();
     let mut value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
     change(&mut value);
     value.to_string().into_bytes()
@@ -87,7 +99,7 @@ fn bad_transforms_json() {
             transforms(|v| v["frames"][1]["transform_matrix"][0][0] = json!("x")),
             &["invalid type", "f64"],
         ),
-        ("NaN", b"{\"fl_x\": NaN, \"frames\": []}".to_vec(), &["transforms.json:1", "expected"]),
+        ("NaN", b"{\"fl_x\": NaN, \"frames\": []}".to_vec(), &["transforms.json", "one frame"]),
         (
             "out of range",
             b"{\"fl_x\": 1e999, \"frames\": []}".to_vec(),
@@ -212,7 +224,7 @@ fn bad_cameras_json() {
             }),
             &["missing field `fy`"],
         ),
-        ("null", cameras_json(|v| v["frames"][1]["fx"] = Value::Null), &["null"]),
+        ("null", cameras_json(|v| v["frames"][1]["fx"] = Value::Null), &["NaN, infinite"]),
         ("word", cameras_json(|v| v["frames"][1]["fx"] = json!("wide")), &["wide"]),
         (
             "three rows short",
@@ -274,16 +286,16 @@ fn bad_re10k_txt() {
         let (folder, _) = made_up(3);
         let path = folder.path().join("a.txt");
         std::fs::write(&path, text).unwrap();
-        check(case, load_scene(&path).map(|_| ()), words);
+        check(case, load(&path), words);
     }
     let (folder, _) = made_up(3);
     let path = folder.path().join("a.txt");
     std::fs::write(&path, b"https://a\n1 \xff").unwrap();
-    check("not UTF-8", load_scene(&path).map(|_| ()), &["a.txt", "UTF-8"]);
+    check("not UTF-8", load(&path), &["a.txt", "UTF-8"]);
     let empty = tempfile::tempdir().unwrap();
     let path = empty.path().join("a.txt");
     std::fs::write(&path, RE10K).unwrap();
-    check("no frames", load_scene(&path).map(|_| ()), &["a.txt", "pictures in"]);
+    check("no frames", load(&path), &["a.txt", "pictures in"]);
 }
 
 #[test]
@@ -313,19 +325,22 @@ fn bad_matrices() {
         let (folder, _) = made_up(3);
         std::fs::write(folder.path().join("K.txt"), k).unwrap();
         std::fs::write(folder.path().join("poses.txt"), poses).unwrap();
-        check(case, load_scene(folder.path()).map(|_| ()), words);
+        check(case, load(folder.path()), words);
     }
     let (folder, _) = made_up(3);
     std::fs::write(folder.path().join("poses.txt"), poses).unwrap();
-    check("no K.txt", load_scene(folder.path()).map(|_| ()), &["K.txt", "No such file"]);
+    check("no K.txt", load(folder.path()), &["K.txt", "No such file"]);
 }
 
 #[test]
 fn bad_pictures() {
     let (folder, cameras) = made_up(3);
     let path = folder.path().join("cameras.json");
-    save_cameras_json(&path, &CameraFile { cameras, units: Units::Unknown, near_far: None })
-        .unwrap();
+    save_cameras_json(
+        &path,
+        &CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() },
+    )
+    .unwrap();
     let picture = folder.path().join("images/001.png");
     let good = std::fs::read(&picture).unwrap();
 
@@ -354,7 +369,7 @@ fn bad_pictures() {
         ("header alone", good[..20].to_vec(), &["001.png"]),
     ] {
         std::fs::write(&picture, bytes).unwrap();
-        check(case, load_scene(folder.path()).map(|_| ()), words);
+        check(case, load(folder.path()), words);
         check(case, image::load(&picture).map(|_| ()), words);
     }
     // The header is complete, the pixels are not: loading the frame fails.
@@ -370,7 +385,7 @@ fn bad_pictures() {
     assert_eq!(scene.frames.len(), 2);
     assert!(scene.warnings[0].contains("001.png"), "{:?}", scene.warnings);
     std::fs::create_dir(&picture).unwrap();
-    check("a folder", load_scene(folder.path()).map(|_| ()), &["001.png", "directory"]);
+    check("a folder", load(folder.path()), &["001.png", "directory"]);
     check(
         "8-bit depth",
         image::load_depth_png(folder.path().join("images/000.png"), 0.001).map(|_| ()),
@@ -382,11 +397,7 @@ fn bad_pictures() {
 fn bad_paths() {
     let folder = tempfile::tempdir().unwrap();
     let at = |n: &str| folder.path().join(n);
-    check(
-        "empty folder",
-        load_scene(folder.path()).map(|_| ()),
-        &["cameras.json", "sparse/0", "none of them"],
-    );
+    check("empty folder", load(folder.path()), &["cameras.json", "sparse/0", "none of them"]);
     check("nothing", load_scene(at("nowhere")).map(|_| ()), &["nowhere", "No such file"]);
     std::fs::write(at("a.ply"), "ply").unwrap();
     check("a .ply", load_scene(at("a.ply")).map(|_| ()), &["a.ply", "pose file", "`ply`"]);
@@ -419,11 +430,24 @@ fn bad_protocols() {
     test.check(&path, 10).unwrap();
 }
 
+/// The error of the first camera that is not read.
+fn all_cameras(cameras: Cameras) -> Result<(), subsplat::files::Error> {
+    cameras.into_values().collect::<Result<Vec<_>, _>>().map(|_| ())
+}
+
+/// An error of the first image without a pose.
+fn all_poses(images: Vec<ColmapImage>) -> Result<(), subsplat::files::Error> {
+    let refused = images.into_iter().find_map(|i| Some((i.place, i.refused?)));
+    refused.map_or(Ok(()), |(place, got)| {
+        Err(subsplat::files::Error::format("images", "a finite pose", got).at(place))
+    })
+}
+
 type Parser = fn(&[u8]) -> Result<(), subsplat::files::Error>;
 
 const BINARY: [(&str, Parser); 3] = [
-    ("cameras", |b| parse_cameras_bin("cameras.bin", b).map(|_| ())),
-    ("images", |b| parse_images_bin("images.bin", b).map(|_| ())),
+    ("cameras", |b| all_cameras(parse_cameras_bin("cameras.bin", b)?)),
+    ("images", |b| all_poses(parse_images_bin("images.bin", b)?)),
     ("points", |b| parse_points_bin("points3D.bin", b).map(|_| ())),
 ];
 
@@ -490,21 +514,17 @@ fn colmap_binary_with_hostile_fields() {
     let images = put(1, 68, &55u32.to_le_bytes());
     let model = folder.path().join("sparse/0");
     colmap_files::write(&model, "bin", [&files[0], &images, &files[2]]);
-    check(
-        "camera 55",
-        load_scene(folder.path()).map(|_| ()),
-        &["images.bin at byte 8", "camera 55"],
-    );
+    check("camera 55", load(folder.path()), &["images.bin at byte 8", "camera 55"]);
     std::fs::write(model.join("points3D.bin"), b"abc").unwrap();
     colmap_files::write(&model, "bin", [&files[0], &files[1], b"abc"]);
-    check("bad points", load_scene(folder.path()).map(|_| ()), &["points3D.bin at byte 0"]);
+    check("bad points", load(folder.path()), &["points3D.bin at byte 0"]);
 }
 
 #[test]
 fn bad_colmap_text() {
     let path = Path::new("x.txt");
-    let cameras = |t: &str| parse_cameras_txt(path, t.as_bytes()).map(|_| ());
-    let images = |t: &str| parse_images_txt(path, t.as_bytes(), &mut Vec::new()).map(|_| ());
+    let cameras = |t: &str| all_cameras(parse_cameras_txt(path, t.as_bytes())?);
+    let images = |t: &str| all_poses(parse_images_txt(path, t.as_bytes(), &mut Vec::new())?);
     let points = |t: &str| parse_points_txt(path, t.as_bytes()).map(|_| ());
     let cases: Vec<(&str, Result<(), subsplat::files::Error>, &[&str])> = vec![
         ("no cameras", cameras("# none\n"), &["x.txt", "at least one camera"]),
@@ -519,8 +539,9 @@ fn bad_colmap_text() {
         ("twice", cameras("1 SIMPLE_PINHOLE 6 4 1 1 1\n1 SIMPLE_PINHOLE 6 4 1 1 1"), &["x.txt:2"]),
         ("short pose", images("1 1 0 0 0 0 0 0"), &["x.txt:1", "camera id"]),
         ("no name", images("1 1 0 0 0 0 0 0 1"), &["picture name"]),
-        ("zero quaternion", images("1 0 0 0 0 0 0 0 1 a.png"), &["quaternion above 0"]),
-        ("NaN pose", images("1 1 0 0 0 0 NaN 0 1 a.png"), &["finite pose"]),
+        ("zero quaternion", images("1 0 0 0 0 0 0 0 1 a.png"), &["quaternion [0.0, 0.0"]),
+        ("NaN pose", images("1 1 0 0 0 0 NaN 0 1 a.png"), &["translation [0.0, NaN"]),
+        ("NaN of C", images("1 1 0 0 0 0 -nan(ind) 0 1 a.png"), &["translation [0.0, NaN"]),
         ("odd points", images("1 1 0 0 0 0 0 0 1 a.png\n1 2 3 4\n"), &["x.txt:2", "triples"]),
         ("short point", points("1 2 3"), &["x.txt:1", "position"]),
         ("NaN point", points("1 2 3 inf 0 0 0 0"), &["finite position"]),

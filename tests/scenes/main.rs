@@ -1,5 +1,6 @@
 //! Tests of scenes: pose formats, pictures, the check of poses, navigation.
 
+mod as_people_have_them;
 mod check;
 mod check_rendered;
 mod hostile_scenes;

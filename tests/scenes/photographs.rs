@@ -376,7 +376,8 @@ fn pairs_are_upright_and_pose_files_are_not() {
     let json = path("cameras.json");
     let upright = NamedCamera::of_frame(&scene.frames[0], "a.png");
     let cameras = vec![upright, NamedCamera::new("b.png", camera(8, 6))];
-    let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+    let content =
+        CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() };
     save_cameras_json(&json, &content).unwrap();
     assert_eq!(load_cameras_json(&json).unwrap(), content);
     let scene = load_scene(&json).unwrap();

@@ -26,8 +26,12 @@ fn cameras_json_round_trips() {
     cameras[3].depth = Some("depth/003.png".to_owned());
     for units in [Units::Unknown, Units::Metres, Units::RealEstate10k] {
         let path = folder.path().join("cameras.json");
-        let content =
-            CameraFile { cameras: cameras.clone(), units, near_far: Some(NearFar::new(0.5, 8.0)) };
+        let content = CameraFile {
+            cameras: cameras.clone(),
+            units,
+            near_far: Some(NearFar::new(0.5, 8.0)),
+            ..Default::default()
+        };
         save_cameras_json(&path, &content).unwrap();
         assert_eq!(load_cameras_json(&path).unwrap(), content);
         let scene = load_scene(folder.path()).unwrap();
@@ -47,7 +51,8 @@ fn cameras_json_round_trips() {
 fn a_camera_list_is_orthonormalised_as_a_scene_is() {
     let (folder, cameras) = made_up(2);
     let path = folder.path().join("cameras.json");
-    let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+    let content =
+        CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() };
     save_cameras_json(&path, &content).unwrap();
     let mut json: serde_json::Value =
         serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
@@ -276,7 +281,12 @@ fn precedence_of_pose_files() {
     assert_eq!(source(), SceneFormat::Transforms);
     save_cameras_json(
         at("cameras.json"),
-        &CameraFile { cameras: cameras.clone(), units: Units::Unknown, near_far: None },
+        &CameraFile {
+            cameras: cameras.clone(),
+            units: Units::Unknown,
+            near_far: None,
+            ..Default::default()
+        },
     )
     .unwrap();
     assert_eq!(source(), SceneFormat::CamerasJson);
@@ -420,7 +430,8 @@ fn pairs_and_exif() {
     let pose_file = folder.path().join("cameras.json");
     let save = |camera| {
         let cameras = vec![NamedCamera::new(cameras[0].file.as_str(), camera)];
-        let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+        let content =
+            CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() };
         save_cameras_json(&pose_file, &content).unwrap();
     };
     save(camera);
@@ -440,7 +451,8 @@ fn a_frame_of_another_shape_is_reported_and_avoided() {
     let pose_file = folder.path().join("cameras.json");
     let save = |cameras: &[NamedCamera]| {
         let cameras = cameras.to_vec();
-        let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+        let content =
+            CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() };
         save_cameras_json(&pose_file, &content).unwrap();
     };
     save(&cameras);

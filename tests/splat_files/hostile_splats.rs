@@ -34,8 +34,9 @@ fn answer(ending: &str, parse: Parse, bytes: &[u8]) -> std::result::Result<Splat
     assert!(start.elapsed() < Duration::from_secs(5), "{name} took {:?}", start.elapsed());
     match result {
         Ok(s) => {
-            // Accepted splats must be finite.
+            // Accepted splats must be finite, and have a rotation.
             assert!(s.rows().iter().chain(s.sh()).all(|v| v.is_finite()));
+            assert!((0..s.len()).all(|i| s.quat_wxyz(i) != [0.0; 4]));
             Ok(s)
         }
         Err(e) => {
@@ -55,12 +56,12 @@ fn refused(ending: &str, bytes: &[u8], what: &str) {
     }
 }
 
-fn small(degree: usize) -> Splats {
+pub fn small(degree: usize) -> Splats {
     let basis = ShBasis::Standard;
     scene(1, Kind { parents: 9, children: 1, degree, gain_channels: 0, basis })
 }
 
-fn written(name: &str, splats: &Splats) -> Vec<u8> {
+pub fn written(name: &str, splats: &Splats) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
     save_splats(&path, splats, &SaveOptions::default()).unwrap();
@@ -111,7 +112,7 @@ fn spz4(splats: &Splats, pack: fn(&[u8]) -> Vec<u8>) -> Vec<u8> {
 }
 
 /// One section of level `level`, buckets as it needs them.
-fn ksplat(level: u16) -> Vec<u8> {
+pub fn ksplat(level: u16) -> Vec<u8> {
     let stride = if level == 0 { 44 } else { 24 };
     let n = 5u32;
     let mut b = vec![0u8; 4096 + 1024];
@@ -133,7 +134,7 @@ fn ksplat(level: u16) -> Vec<u8> {
 }
 
 /// A packed .ply of two chunks, degree 1.
-fn compressed_ply() -> Vec<u8> {
+pub fn compressed_ply() -> Vec<u8> {
     let n = 300;
     let mut head = "ply\nformat binary_little_endian 1.0\nelement chunk 2\n".to_owned();
     for name in [
@@ -479,7 +480,8 @@ fn lying_ply_headers() {
             ),
             "numbers",
         ),
-        (splat_with("1", le, &[], &[0xff; 56]), "splat 0"),
+        (splat_with("1", le, &[], &[0xff; 56]), "splat 0 (mean NaN)"),
+        (splat_with("1", le, &[], &none), "1 of 1 splats, whose rotation is 0 0 0 0"),
     ] {
         refused("ply", &bytes, what);
     }
@@ -488,7 +490,7 @@ fn lying_ply_headers() {
     let at = bytes.iter().position(|b| *b == b'?').unwrap();
     bytes[at] = 0xff;
     refused("ply", &bytes, "UTF-8");
-    let mut bytes = splat_with("1", le, &["comment ?"], &none);
+    let mut bytes = splat_with("1", le, &["comment ?"], &[0x3c; 56]);
     let at = bytes.iter().position(|b| *b == b'?').unwrap();
     bytes[at] = 0xff;
     assert!(answer("ply", parse_ply, &bytes).is_ok());
@@ -525,7 +527,10 @@ fn lying_compressed_plys() {
     }
     let mut nan = good.clone();
     let chunks = good.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
-    nan[chunks..chunks + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+    for chunk in 0..2 {
+        let at = chunks + 48 * chunk;
+        nan[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+    }
     refused("ply", &nan, "mean NaN");
 }
 
@@ -639,8 +644,7 @@ fn lying_ksplats() {
         (4116, &[0, 0], "5244 bytes"),
         (4120 + 12, &[0xff; 4], "section 0"),
         (4136, &[4, 0], "SH degree 0 to 3"),
-        (4112, &f32::NAN.to_le_bytes(), "splat 0"),
-        (5124, &f32::INFINITY.to_le_bytes(), "splat 0"),
+        (4112, &f32::NAN.to_le_bytes(), "5 of 5 splats, which hold numbers that are NaN"),
     ] {
         let mut b = good.clone();
         b[at..at + bytes.len()].copy_from_slice(bytes);
@@ -659,9 +663,7 @@ fn lying_ksplats() {
 fn lying_splats() {
     let good = written("a.splat", &small(0));
     refused("splat", &good[..good.len() - 1], "records of 32 bytes");
-    let mut b = good.clone();
-    b[32..36].copy_from_slice(&f32::NAN.to_le_bytes());
-    refused("splat", &b, "splat 1");
+    refused("splat", &[0; 96], "3 of 3 splats, whose rotation is 0 0 0 0");
     let mut b = good;
     b[64 + 12..64 + 16].copy_from_slice(&(-1.0f32).to_le_bytes());
     refused("splat", &b, "scales of 0 or more");

@@ -1,5 +1,6 @@
-//! Files of Gaussians: round trips, fixtures of other projects, hostile bytes.
+//! Files of Gaussians: round trips, fixtures of other projects, hostile bytes, rows that are left out.
 
 mod hostile_splats;
+mod left_out;
 mod splat_files;
 mod splat_fixtures;

@@ -491,7 +491,7 @@ fn info_describes_what_is_there() {
     assert_eq!(json["format"], "ply");
     assert_eq!(json["scale"].as_array().unwrap().len(), 7);
 
-    // A NaN mean and an infinite scale: counted here, refused by index on loading.
+    // A NaN mean and an infinite scale are left out and counted, the first by index.
     let mut bytes = std::fs::read(&path).unwrap();
     let first = bytes.len() - 101 * (17 + 45) * 4;
     for (i, field, v) in [(5, 2, f32::NAN), (9, 9 + 45 + 1, f32::INFINITY)] {
@@ -500,9 +500,11 @@ fn info_describes_what_is_there() {
     }
     let path = folder.path().join("nan.ply");
     std::fs::write(&path, bytes).unwrap();
-    assert_eq!(splat_info(&path).unwrap().non_finite, 2);
-    let e = load_splats(&path).unwrap_err().to_string();
-    assert!(e.contains("nan.ply splat 5") && e.contains("mean NaN"), "{e}");
+    let info = splat_info(&path).unwrap();
+    assert_eq!((info.count, info.non_finite, info.zero_rows, info.invisible), (99, 2, 0, 1));
+    let [note] = &info.notes[..] else { panic!("{:?}", info.notes) };
+    assert!(note.contains("2 of 101 splats") && note.contains("splat 5 (mean NaN)"), "{note}");
+    assert_eq!(load_splats(&path).unwrap().len(), 99);
 }
 
 /// A .glb parsed by hand: the fields that viewers rely on.

@@ -384,15 +384,16 @@ fn check_dialect(s: &Splats, i: usize, rests: usize, colours: [&str; 3]) {
 }
 
 #[test]
-fn infinite_logits_and_zero_quaternions_have_a_meaning() {
-    let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n\
+fn infinite_logits_have_a_meaning_and_zero_quaternions_have_none() {
+    let text = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n\
         property float z\nproperty float f_dc_0\nproperty float f_dc_1\nproperty float f_dc_2\n\
         property float opacity\nproperty float scale_0\nproperty float scale_1\n\
         property float scale_2\nproperty float rot_0\nproperty float rot_1\n\
         property float rot_2\nproperty float rot_3\nend_header\n\
-        0 0 0 0 0 0 inf 0 0 -inf 0 0 0 0\n1 2 3 0 0 0 -inf 0 0 0 0 0 5 0\n";
+        0 0 0 0 0 0 inf 0 0 -inf 3 0 0 0\n4 5 6 1 1 1 2 0 0 0 0 0 0 0\n\
+        1 2 3 0 0 0 -inf 0 0 0 0 0 5 0\n";
     let s = parse_ply(text.as_bytes(), "ends.ply").unwrap();
-    assert_eq!((s.opacity(0), s.opacity(1)), (1.0, 0.0));
+    assert_eq!((s.len(), s.opacity(0), s.opacity(1)), (2, 1.0, 0.0));
     assert_eq!(s.scale(0), [1.0, 1.0, 0.0]);
     assert_eq!((s.quat_wxyz(0), s.quat_wxyz(1)), ([1., 0., 0., 0.], [0., 0., 1., 0.]));
 }

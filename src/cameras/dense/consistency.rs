@@ -35,13 +35,18 @@ pub(super) fn certain(view: usize, views: &[DenseView<'_>], fields: &[Field]) ->
     let is_certain = |(i, plane): (usize, &Plane)| {
         let at = [(i % width) as f32 + 0.5, (i / width) as f32 + 0.5];
         plane.difference <= DIFFERENCE_MAX
+            && is_kept(views[view].picture, i)
             && ways.iter().any(|(there, back, field, picture)| {
                 let Some([x, y]) = there.project(at, plane.inverse) else { return false };
                 let inside = x >= 0.0 && y >= 0.0;
                 if !inside || x >= picture.width() as f32 || y >= picture.height() as f32 {
                     return false;
                 }
-                let other = &field[y as usize * picture.width() + x as usize];
+                let pixel = y as usize * picture.width() + x as usize;
+                if !is_kept(picture, pixel) {
+                    return false;
+                }
+                let other = &field[pixel];
                 let offset = [x - x.floor() - 0.5, y - y.floor() - 0.5];
                 let inverse =
                     other.inverse + other.slopes[0] * offset[0] + other.slopes[1] * offset[1];
@@ -50,6 +55,11 @@ pub(super) fn certain(view: usize, views: &[DenseView<'_>], fields: &[Field]) ->
             })
     };
     field.par_iter().enumerate().with_min_len(TASK).map(is_certain).collect()
+}
+
+/// Returns whether pixel `i` of a picture is not masked.
+fn is_kept(picture: &GrayImage, i: usize) -> bool {
+    picture.mask().is_none_or(|mask| mask.kept()[i])
 }
 
 /// `factors` where the depth is certain; elsewhere the mean of their logarithms nearby, by weights that fall

@@ -34,7 +34,7 @@ use subsplat_kernels::camera::{Camera, NearFar};
 /// A photograph with a first depth.
 #[derive(Clone, Copy, Debug)]
 pub struct DenseView<'a> {
-    /// Luma of the photograph.
+    /// Luma of the photograph. Depth is not matched at masked pixels, nor with those of other photographs.
     pub picture: &'a GrayImage,
     /// Its camera, of the picture's size.
     pub camera: &'a Camera,

@@ -90,7 +90,7 @@ pub(super) struct Patch {
 }
 
 impl Patch {
-    /// The weights of the patch around pixel (x, y); 0 outside the picture.
+    /// The weights of the patch around pixel (x, y); 0 outside the picture and at masked pixels.
     pub fn weights(picture: &GrayImage, x: usize, y: usize) -> [f32; SAMPLES] {
         let centre = picture.row(y)[x];
         std::array::from_fn(|i| {
@@ -159,6 +159,17 @@ impl Patch {
             down[i] = row - top as f32;
             corners[i] = (top * width + left) as u32;
         }
+        if let Some(mask) = source.mask() {
+            // A masked pixel shows something else, or nothing.
+            for i in 0..SAMPLES {
+                let right = usize::from(across[i] > 0.5);
+                let below = if down[i] > 0.5 { source.width() } else { 0 };
+                let at = corners[i] as usize + right + below;
+                if mask.kept().get(at) == Some(&false) {
+                    weights[i] = 0.0;
+                }
+            }
+        }
         let mut corner_values = [[0.0f32; PADDED]; 4];
         let (pixels, below) = (source.pixels(), source.pixels().get(source.width()..));
         let below = below.filter(|below| !below.is_empty()).unwrap_or(pixels);
@@ -208,11 +219,12 @@ impl Patch {
     }
 }
 
-/// Value of sample `i` of the patch around pixel (x, y); `None` outside the picture.
+/// Value of sample `i` of the patch around pixel (x, y); `None` outside the picture and at masked pixels.
 #[inline(always)]
 fn sample(picture: &GrayImage, x: usize, y: usize, i: usize) -> Option<f32> {
     let column = x.checked_add_signed(X_OFFSETS[i] as isize)?;
     let row = y.checked_add_signed(Y_OFFSETS[i] as isize)?;
     let inside = column < picture.width() && row < picture.height();
-    inside.then(|| picture.pixels()[row * picture.width() + column])
+    let at = row * picture.width() + column;
+    (inside && picture.mask().is_none_or(|mask| mask.kept()[at])).then(|| picture.pixels()[at])
 }

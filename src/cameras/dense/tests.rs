@@ -1,5 +1,6 @@
 use super::patch::{HIDDEN, PADDED, Patch};
 use super::*;
+use crate::scene::mask::Mask;
 use glam::{DVec3, Mat4, Quat, Vec2, Vec3};
 use subsplat_kernels::camera::Intrinsics;
 
@@ -171,6 +172,46 @@ fn broken_depths_stay_and_a_break_ends() {
     let views = views(&pictures, &cameras, &first);
     let range = NearFar { near: 1.0, far: 6.0 };
     assert!(match_depth(&views, range, &mut |_| ControlFlow::Break(())).is_none());
+}
+
+/// Depth is not matched at masked pixels, nor with those of the other photograph.
+#[test]
+fn masked_pixels_match_nothing() {
+    let cameras = cameras();
+    let [(a, pa), (b, pb)] = [0, 1].map(|i| seen(&cameras[i], NORMAL));
+    let truth = [a, b];
+    let wrong = |truth: &[f32]| truth.iter().map(|z| 1.05 * z).collect::<Vec<f32>>();
+    let first = [wrong(&truth[0]), wrong(&truth[1])];
+    // Something else stands before the second camera.
+    let inside = |x: f32, y: f32| x > 20.0 && x < 50.0 && y > 15.0 && y < 45.0;
+    let masked: Vec<bool> = (0..SIZE * SIZE)
+        .map(|i| inside((i % SIZE) as f32 + 0.5, (i / SIZE) as f32 + 0.5))
+        .collect();
+    let pixels = pb.pixels().iter().zip(&masked).enumerate();
+    let pixels = pixels.map(|(i, (v, masked))| if *masked { (i % 3) as f32 / 2.0 } else { *v });
+    let pb = GrayImage::new(SIZE, SIZE, pixels.collect()).unwrap();
+    let kept = masked.iter().map(|masked| !masked).collect();
+    let pb = pb.masked(Mask::new(SIZE, SIZE, kept).unwrap());
+    let found = run(&views(&[pa, pb], &cameras, &first));
+    let there = |i: usize| {
+        let px = Vec2::new((i % SIZE) as f32 + 0.5, (i / SIZE) as f32 + 0.5);
+        cameras[1].project(cameras[0].intrinsics().unproject(px) * truth[0][i])
+    };
+    let mut counts = [0; 2];
+    for i in 0..SIZE * SIZE {
+        assert!(!(masked[i] && found[1].certain[i]), "{i}");
+        if there(i).is_some_and(|p| inside(p.x, p.y)) {
+            counts[0] += 1;
+            counts[1] += usize::from(found[0].certain[i]);
+        }
+    }
+    assert!(counts[0] > 500 && 20 * counts[1] < counts[0], "{counts:?}");
+    for v in 0..2 {
+        let errors = errors(&found[v], &first[v], &truth[v], |i| found[v].certain[i]);
+        assert!(errors.len() > 1500, "{}", errors.len());
+        let at = |share: f32| errors[(share * errors.len() as f32) as usize];
+        assert!(at(0.5) < 0.004 && at(0.95) < 0.02, "{} {}", at(0.5), at(0.95));
+    }
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! The estimate for applications: from photographs to cameras, points and a confidence.
 
 use super::absolute::Absolute;
+use super::groups;
 use super::pair::{self, PairEstimate};
 use super::photo::PosePhoto;
 use super::reconstruct::{self, Edge, Model, Point, midpoint};
@@ -221,6 +222,15 @@ pub struct PoseEstimate {
     pub direction_error_deg: f64,
     /// Weaknesses, for the user.
     pub warnings: Vec<PoseWarning>,
+}
+
+impl PoseEstimate {
+    /// One sentence, without a final full stop, for each reason in [`PoseEstimate::left_out`].
+    /// `name` gives the name of the photograph of an index. A sentence has up to three names and the
+    /// number of the other photographs. Empty where every photograph has a camera.
+    pub fn left_out_sentences(&self, name: impl Fn(usize) -> String) -> Vec<String> {
+        groups::sentences(&self.left_out, name)
+    }
 }
 
 /// Smallest number of matches, found without a geometry, that agree with a pose. Random matches of
@@ -466,17 +476,9 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
     let mut model =
         reconstruct::build(&exact, &usable, prior, options.seed).ok_or(PoseRefusal::NoPair)?;
     model.focal_scale *= first;
-    let mut left_out = Vec::new();
-    for (photo, camera) in model.cameras.iter().enumerate() {
-        if camera.is_none() {
-            let partners = usable.iter().filter(|e| e.photos.contains(&photo)).count();
-            let reason = match partners {
-                0 => "no other photograph has enough in common with it".to_owned(),
-                n => format!("it matches {n} photograph(s), but its points do not fit the others"),
-            };
-            left_out.push(LeftOut { photo, reason });
-        }
-    }
+    let placed: Vec<bool> = model.cameras.iter().map(Option::is_some).collect();
+    let pairs: Vec<[usize; 2]> = usable.iter().map(|e| e.photos).collect();
+    let left_out = groups::left_out(&placed, &pairs);
     let all: Vec<&PosePhoto> = photos.iter().collect();
     Ok(finished(&all, model, left_out, Vec::new()))
 }

@@ -8,7 +8,8 @@
 //!
 //! Two photographs: points are matched, an essential matrix is estimated and refined
 //! (`pair.rs`). Three and more: pairs are joined one by one (`reconstruct.rs`) and adjusted
-//! together (`bundle.rs`). The world's +y axis points down as far as the cameras' horizon says
+//! together (`bundle.rs`). Of photographs that fall into groups without common points the largest
+//! group is used (`groups.rs`). The world's +y axis points down as far as the cameras' horizon says
 //! (`world.rs`); its unit is the median depth of the points.
 
 mod absolute;
@@ -16,6 +17,7 @@ mod adjust;
 mod bundle;
 mod estimate;
 mod five_point;
+mod groups;
 mod pair;
 mod photo;
 mod ransac;

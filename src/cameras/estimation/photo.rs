@@ -5,6 +5,8 @@ use crate::cameras::matches::features;
 use crate::cameras::matches::features::{Features, Orientation};
 use crate::cameras::matches::pairs::Pair;
 use crate::cameras::matches::{GrayImage, align};
+use crate::scene::mask::Mask;
+use crate::scene::pictures::Rgb;
 use glam::DVec2;
 use rayon::prelude::*;
 use subsplat_kernels::camera::{CameraError, Intrinsics};
@@ -105,13 +107,42 @@ impl PosePhoto {
     /// # Errors
     /// A lens that is no camera; `rgb` of another length than 3·W·H of the lens's size.
     pub fn from_rgb8(rgb: &[u8], lens: Lens, max_features: usize) -> Result<Self, PosePhotoError> {
+        Self::detected(rgb, |w, h| GrayImage::from_rgb8(w, h, rgb), lens, max_features)
+    }
+
+    /// [`PosePhoto::from_rgb8`] of the pixels that `mask` keeps. A mask of another size is ignored.
+    ///
+    /// # Errors
+    /// Those of [`PosePhoto::from_rgb8`].
+    pub fn from_picture(
+        picture: &Rgb,
+        mask: Option<&Mask>,
+        lens: Lens,
+        max_features: usize,
+    ) -> Result<Self, PosePhotoError> {
+        let mask = mask.filter(|mask| mask.fits(picture));
+        let size = (picture.width, picture.height);
+        let grey = |w, h| match mask {
+            Some(_) if (w, h) == size => GrayImage::from_picture(picture, mask),
+            _ => GrayImage::from_rgb8(w, h, &picture.data),
+        };
+        Self::detected(&picture.data, grey, lens, max_features)
+    }
+
+    /// Detects the features of `rgb` in its grey `image` of a given size.
+    fn detected(
+        rgb: &[u8],
+        image: impl FnOnce(usize, usize) -> Option<GrayImage>,
+        lens: Lens,
+        max_features: usize,
+    ) -> Result<Self, PosePhotoError> {
         lens.intrinsics.check()?;
         if !(lens.deviation >= 0.0 && lens.deviation.is_finite()) {
             return Err(PosePhotoError::Deviation { found: lens.deviation });
         }
         let (w, h) = (lens.intrinsics.width, lens.intrinsics.height);
         let length = PosePhotoError::Length { width: w, height: h, found: rgb.len() };
-        let image = GrayImage::from_rgb8(w, h, rgb).ok_or(length)?;
+        let image = image(w, h).ok_or(length)?;
         let mut photo = Self::new(image, lens, max_features, Orientation::Upright);
         photo.sample_colours(|x, y| {
             let at = 3 * (y * w + x);

@@ -1,14 +1,17 @@
 //! Cameras and points of three or more photographs, one photograph after the other.
 //!
-//! Pairs are matched and verified ([`Edge`]); their matches join to tracks. The best pair starts;
-//! then the photograph that sees most points is located among them, its tracks give new points,
-//! and all cameras and points are adjusted together.
+//! Pairs are matched and verified ([`Edge`]); their matches join to tracks. The best pair of the
+//! largest group ([`Groups`]) starts; then the photograph that sees most points is located among
+//! them, its tracks give new points, and all cameras and points are adjusted together. Where a
+//! larger group is left out than was placed, it is reconstructed as well, and the model with most
+//! photographs is used. Thereby photographs of which all fit are reconstructed once.
 //!
 //! Source: N. Snavely, S. Seitz and R. Szeliski, "Photo tourism", 2006; J. Schönberger and
 //! J.-M. Frahm, "Structure-from-motion revisited", 2016.
 
 use super::absolute::{Absolute, Sight, locate};
 use super::bundle::{Bundle, Observation};
+use super::groups::Groups;
 use super::pair::{self, PairEstimate};
 use super::photo::{PosePhoto, aligned_position, deviations};
 use super::refine::FocalPrior;
@@ -36,6 +39,9 @@ const START_ANGLE: f64 = 0.105;
 /// Photographs that are compared with all others; of more, each is compared with this many
 /// neighbours in their order and with the photographs most alike.
 const PARTNERS: usize = 10;
+/// Largest number of models that are built: the first one, and others of photographs that it leaves
+/// out. It bounds the time where one model after the other places few photographs.
+const MODELS: usize = 4;
 /// Features by which likeness is judged.
 const SKETCH: usize = 700;
 
@@ -72,6 +78,13 @@ pub(super) struct Model {
     pub rotation_deviation: f64,
     /// Largest standard deviation of a camera's position over the extent of all.
     pub position_deviation: f64,
+}
+
+impl Model {
+    /// Number of photographs with a pose.
+    fn placed(&self) -> usize {
+        self.cameras.iter().flatten().count()
+    }
 }
 
 /// Returns the pairs of photographs that are compared in full: all of a few photographs, else those
@@ -173,14 +186,44 @@ struct Builder<'a> {
 
 /// Builds cameras and points of `photos` from verified pairs. `prior` is the knowledge of the
 /// focal length over that of the lenses. `None` where no pair is wide enough to start with.
+///
+/// The largest group of photographs is built first. A group of photographs that no model has placed
+/// is built as well where it is larger than the best model: a wrong pair joins two groups, or a model
+/// started with a wrong pair. Other photographs may join it again. Of models with equally many
+/// photographs the first one is returned.
 pub(super) fn build(
     photos: &[PosePhoto],
     edges: &[Edge],
     prior: Option<FocalPrior>,
     seed: u64,
 ) -> Option<Model> {
+    let mut is_left = vec![true; photos.len()];
+    let mut best: Option<Model> = None;
+    for _ in 0..MODELS {
+        let most = best.as_ref().map_or(0, Model::placed);
+        let Some((_, start)) = start(edges, &is_left).filter(|(size, _)| *size > most) else {
+            break;
+        };
+        let model = grow(photos, edges, start, prior, seed);
+        for (is_left, camera) in is_left.iter_mut().zip(&model.cameras) {
+            *is_left &= camera.is_none();
+        }
+        if model.placed() > most {
+            best = Some(model);
+        }
+    }
+    best
+}
+
+/// Builds cameras and points from the pair `start`, of all photographs that fit.
+fn grow(
+    photos: &[PosePhoto],
+    edges: &[Edge],
+    start: &Edge,
+    prior: Option<FocalPrior>,
+    seed: u64,
+) -> Model {
     let mut builder = Builder::new(photos, edges, prior);
-    let start = start(edges)?;
     let [a, b] = start.photos;
     builder.cameras[a] = Some(Absolute::IDENTITY);
     builder.cameras[b] =
@@ -205,7 +248,7 @@ pub(super) fn build(
         builder.triangulate();
         builder.adjust(25);
     }
-    Some(builder.finish())
+    builder.finish()
 }
 
 /// Cameras that were adjusted from given ones.
@@ -275,15 +318,21 @@ pub(super) fn locate_others(
     (known.len()..photos.len()).into_par_iter().map(|i| builder.register(i, seed)).collect()
 }
 
-/// The pair to start with: many matches and a wide angle between their rays.
-fn start(edges: &[Edge]) -> Option<&Edge> {
+/// The pair to start with, and the number of photographs of its group. Pairs and groups are those of
+/// the photographs that are left. A pair of the largest group that has one starts: the one with many
+/// matches and a wide angle between their rays.
+fn start<'a>(edges: &'a [Edge], is_left: &[bool]) -> Option<(usize, &'a Edge)> {
+    let left = || edges.iter().filter(|e| e.photos.iter().all(|&photo| is_left[photo]));
+    let groups = Groups::new(is_left.len(), left().map(|e| e.photos));
     let score = |e: &Edge| {
         let angle = e.estimate.median_angle();
         let certain = 1.0 - e.estimate.rival.min(1.0);
         e.estimate.inliers.len() as f64 * (angle / START_ANGLE).min(1.0).powi(2) * certain.sqrt()
     };
-    let scored = edges.iter().map(|e| (score(e), e));
-    scored.reduce(|a, b| if b.0 > a.0 { b } else { a }).filter(|s| s.0 > 0.0).map(|s| s.1)
+    let sized = left().map(|e| ((groups.size(e.photos[0]), score(e)), e));
+    // The first one of equal pairs.
+    let best = sized.filter(|s| s.0.1 > 0.0).reduce(|a, b| if b.0 > a.0 { b } else { a });
+    best.map(|((size, _), e)| (size, e))
 }
 
 impl<'a> Builder<'a> {
@@ -536,4 +585,148 @@ pub(super) fn midpoint(origins: [DVec3; 2], directions: [DVec3; 2]) -> DVec3 {
     let s = (between.dot(u) - c * between.dot(v)) / n;
     let t = (c * between.dot(u) - between.dot(v)) / n;
     0.5 * (origins[0] + s * u + origins[1] + t * v)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::photo::Lens;
+    use super::super::refine::Refined;
+    use super::super::two_view::{Bearings, Relative, rotation};
+    use super::*;
+    use crate::cameras::matches::GrayImage;
+    use crate::cameras::matches::features::{Feature, Features, PyramidPoint};
+    use crate::cameras::matches::pairs::Pair;
+    use crate::cameras::matches::random::SplitMix;
+    use subsplat_kernels::camera::Intrinsics;
+
+    /// Side of the photographs, px.
+    const SIDE: usize = 64;
+
+    /// Photographs without texture, whose features show `points`, from cameras on an arc.
+    fn photographs(count: usize, points: usize, random: &mut SplitMix) -> Vec<PosePhoto> {
+        let coordinate = |random: &mut SplitMix| 2.0 * random.uniform() - 1.0;
+        let points: Vec<DVec3> = (0..points)
+            .map(|_| {
+                DVec3::from_array(std::array::from_fn(|_| coordinate(random))) + DVec3::Z * 4.0
+            })
+            .collect();
+        (0..count)
+            .map(|i| {
+                let turn = rotation(DVec3::Y * (0.12 * i as f64));
+                let centre = DVec3::Z * 4.0;
+                let pose = Absolute { rotation: turn, translation: centre - turn * centre };
+                photograph(&points, &pose)
+            })
+            .collect()
+    }
+
+    fn photograph(points: &[DVec3], pose: &Absolute) -> PosePhoto {
+        let intrinsics = Intrinsics::from_fov_x(1.0, SIDE, SIDE);
+        let bearings: Vec<DVec2> =
+            points.iter().map(|p| pose.to_camera(*p)).map(|q| q.truncate() / q.z).collect();
+        let feature = |b: &DVec2| {
+            let [x, y] = [b.x, b.y].map(|v| v as f32 * intrinsics.fx + 0.5 * SIDE as f32);
+            let position = PyramidPoint { octave: 0, level: 1, x, y, sigma: 1.0, angle: 0.0 };
+            Feature { x, y, size: 1.0, response: 1.0, position }
+        };
+        let features =
+            Features { points: bearings.iter().map(feature).collect(), descriptors: Vec::new() };
+        PosePhoto {
+            image: GrayImage::new(SIDE, SIDE, vec![0.5; SIDE * SIDE]).unwrap(),
+            features,
+            lens: Lens::known(intrinsics),
+            working: intrinsics,
+            colours: vec![[0; 3]; bearings.len()],
+            bearings,
+        }
+    }
+
+    /// The pair of photographs `i` and `j` with the pose `relative`. The first `shared` features of both
+    /// are matched.
+    fn edge(photos: &[PosePhoto], [i, j]: [usize; 2], shared: usize, relative: Relative) -> Edge {
+        let deviation = deviations(&photos[i])[0];
+        let bearings =
+            |k: usize| Bearings { a: photos[i].bearings[k], b: photos[j].bearings[k], deviation };
+        let estimate = PairEstimate {
+            refined: Refined { relative, focal_scale: 1.0, information: Default::default() },
+            inliers: (0..shared).map(|k| Pair { a: k, b: k, ratio: 0.5 }).collect(),
+            points: (0..shared).map(bearings).collect(),
+            matches: shared,
+            consistent: shared,
+            free_focal: false,
+            rival: 0.0,
+        };
+        Edge { photos: [i, j], estimate }
+    }
+
+    /// All pairs of the `count` photographs of one scene from `first` on.
+    fn edges_of_scene(photos: &[PosePhoto], first: usize, count: usize) -> Vec<Edge> {
+        let mut edges = Vec::new();
+        for i in 0..count {
+            for j in i + 1..count {
+                let turn = rotation(DVec3::Y * (0.12 * (j - i) as f64));
+                let centre = DVec3::Z * 4.0;
+                let translation = (centre - turn * centre).normalize();
+                let shared = photos[first + i].bearings.len();
+                let relative = Relative { rotation: turn, translation };
+                edges.push(edge(photos, [first + i, first + j], shared, relative));
+            }
+        }
+        edges
+    }
+
+    /// Photographs of scenes, each with (photographs, points), one scene after the other.
+    fn scenes(of: &[(usize, usize)]) -> (Vec<PosePhoto>, Vec<Edge>) {
+        let mut random = SplitMix(11);
+        let all = of.iter().map(|&(count, points)| photographs(count, points, &mut random));
+        let photos: Vec<PosePhoto> = all.flatten().collect();
+        let (mut edges, mut first) = (Vec::new(), 0);
+        for &(count, _) in of {
+            edges.extend(edges_of_scene(&photos, first, count));
+            first += count;
+        }
+        (photos, edges)
+    }
+
+    fn placed(photos: &[PosePhoto], edges: &[Edge]) -> Vec<usize> {
+        let model = build(photos, edges, None, 1).unwrap();
+        (0..photos.len()).filter(|&i| model.cameras[i].is_some()).collect()
+    }
+
+    #[test]
+    fn the_larger_group_is_used_and_not_the_best_pair() {
+        let (photos, edges) = scenes(&[(3, 160), (5, 60)]);
+        let (_, best) = start(&edges[..3], &[true; 8]).unwrap();
+        assert_eq!(best.estimate.inliers.len(), 160);
+        assert_eq!(placed(&photos, &edges), [3, 4, 5, 6, 7]);
+        // Of equally large groups the one of the best pair.
+        let (photos, edges) = scenes(&[(3, 60), (3, 160)]);
+        assert_eq!(placed(&photos, &edges), [3, 4, 5]);
+    }
+
+    #[test]
+    fn groups_that_a_wrong_pair_joins_are_built_one_after_the_other() {
+        let (photos, mut edges) = scenes(&[(3, 160), (5, 60)]);
+        let relative = edges[0].estimate.refined.relative;
+        edges.push(edge(&photos, [1, 6], 24, relative));
+        let (size, first) = start(&edges, &[true; 8]).unwrap();
+        assert_eq!((size, first.estimate.inliers.len()), (8, 160));
+        assert_eq!(placed(&photos, &edges), [3, 4, 5, 6, 7]);
+        // The other way round the first model stays.
+        let (photos, mut edges) = scenes(&[(3, 60), (5, 160)]);
+        edges.push(edge(&photos, [1, 6], 24, relative));
+        assert_eq!(placed(&photos, &edges), [3, 4, 5, 6, 7]);
+    }
+
+    #[test]
+    fn one_group_starts_with_its_best_pair() {
+        let (photos, edges) = scenes(&[(5, 60)]);
+        let (size, first) = start(&edges, &[true; 5]).unwrap();
+        let angles: Vec<f64> = edges.iter().map(|e| e.estimate.median_angle()).collect();
+        let wide = angles.iter().position(|a| *a > START_ANGLE).unwrap();
+        assert_eq!((size, first.photos), (5, edges[wide].photos), "{angles:?}");
+        assert_eq!(placed(&photos, &edges), [0, 1, 2, 3, 4]);
+        assert!(start(&edges, &[true, false, false, false, false]).is_none());
+        assert!(build(&photos, &[], None, 1).is_none());
+    }
 }

@@ -39,8 +39,8 @@ pub(super) fn tracks(matches: impl Iterator<Item = [FeatureId; 2]>) -> Vec<Vec<F
     all
 }
 
-/// Root of a tree of the forest, with shorter paths afterwards.
-fn root(parents: &mut [usize], mut at: usize) -> usize {
+/// Root of a tree of the forest `parents`, with shorter paths afterwards.
+pub(super) fn root(parents: &mut [usize], mut at: usize) -> usize {
     while parents[at] != at {
         parents[at] = parents[parents[at]];
         at = parents[at];

@@ -30,6 +30,10 @@ const MAX_CURVATURE_RATIO: f32 = 10.0;
 const DOUBLE_BELOW: usize = 700;
 /// Width of the border of an octave that holds no features, px.
 const BORDER: usize = 4;
+/// Distance of features from masked pixels, px of the picture and multiples of their size: the difference of Gaussians
+/// reads about two standard deviations around, and masks are seldom right to the pixel.
+const MASK_MARGIN: f32 = 2.0;
+const MASK_SIZES: f32 = 2.0;
 /// Grid cells along the longer side, over which features are spread.
 const GRID: usize = 16;
 /// Largest number of features of a cell, in multiples of an even share.
@@ -103,7 +107,7 @@ pub(crate) struct Octave {
     differences: Vec<GrayImage>,
 }
 
-/// Detects at most `max_features` features, spread over the picture. [`Orientation::Gradient`] may
+/// Detects at most `max_features` features, spread over the pixels that the picture's mask keeps. [`Orientation::Gradient`] may
 /// add a second copy of a feature with several strong gradient directions.
 pub(crate) fn detect(image: &GrayImage, max_features: usize, orientation: Orientation) -> Features {
     let doubled = image.width().max(image.height()) < DOUBLE_BELOW;
@@ -118,6 +122,9 @@ pub(crate) fn detect(image: &GrayImage, max_features: usize, orientation: Orient
         .enumerate()
         .flat_map(|(o, octave)| extrema(octave, o, unit * (1u32 << o) as f32))
         .collect();
+    if let Some(mask) = image.mask() {
+        found.retain(|f| mask.keeps_around([f.x, f.y], MASK_MARGIN + MASK_SIZES * f.size));
+    }
     // A total order makes the result independent of the threads.
     found.sort_by(|a, b| {
         b.response.total_cmp(&a.response).then(a.y.total_cmp(&b.y)).then(a.x.total_cmp(&b.x))
@@ -314,4 +321,54 @@ fn spread(sorted: Vec<Feature>, image: &GrayImage, max_features: usize) -> Vec<F
         }
     }
     kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::mask::Mask;
+    use crate::scene::pictures::Rgb;
+
+    /// Blocks of random brightness, and a mask over the middle with a bright frame.
+    fn masked(side: usize) -> (Rgb, Mask) {
+        let mut picture = Rgb::black(side, side);
+        let mut kept = vec![true; side * side];
+        for (i, pixel) in picture.data.chunks_exact_mut(3).enumerate() {
+            let (x, y) = (i % side, i / side);
+            let block = (y / 6 * side + x / 6) as u64;
+            pixel.fill((subsplat_kernels::layout::random::mix(block) >> 57) as u8);
+            let inside = |v: usize| (side / 4..3 * side / 4).contains(&v);
+            if inside(x) && inside(y) {
+                kept[i] = false;
+                pixel.fill(if (x / 5 + y / 5) % 2 == 0 { 255 } else { 130 });
+            }
+        }
+        (picture, Mask::new(side, side, kept).unwrap())
+    }
+
+    #[test]
+    fn masked_pixels_have_no_features() {
+        let (picture, mask) = masked(240);
+        let find = |mask: Option<&Mask>, orientation| {
+            detect(&GrayImage::from_picture(&picture, mask).unwrap(), 800, orientation)
+        };
+        for orientation in [Orientation::Upright, Orientation::Gradient] {
+            let inside = |f: &Feature| !mask.keeps_around([f.x, f.y], 2.0);
+            let all = find(None, orientation);
+            assert!(all.points.iter().filter(|f| inside(f)).count() > 50);
+            let kept = find(Some(&mask), orientation);
+            assert!(kept.points.len() > 200, "{}", kept.points.len());
+            assert!(!kept.points.iter().any(inside));
+            assert_eq!(kept.descriptors.len(), 128 * kept.points.len());
+        }
+        // The mask follows the picture to another size and side.
+        let grey = GrayImage::from_picture(&picture, Some(&mask)).unwrap();
+        let small = grey.reduced(120, 120).flipped();
+        let small_mask = small.mask().unwrap().clone();
+        assert_eq!(small_mask.count(), 120 * 120 * 3 / 4);
+        let found = detect(&small, 800, Orientation::Upright);
+        assert!(found.points.iter().all(|f| small_mask.keeps_around([f.x, f.y], 2.0)));
+        // A mask of another size is refused.
+        assert!(GrayImage::from_picture(&Rgb::black(8, 8), Some(&mask)).is_none());
+    }
 }

@@ -1,8 +1,11 @@
 //! Grey pictures for matching: access, Gaussian blur, area reduction, resampling by 2.
 //!
 //! Values are in [0, 1], row-major. The centre of pixel (i, j) is (i + 0.5, j + 0.5), as in
-//! `camera.rs`.
+//! `camera.rs`. Blurred, doubled and decimated pictures have no mask: features are those of the picture from which
+//! they are made.
 
+use crate::scene::mask::Mask;
+use crate::scene::pictures::Rgb;
 use rayon::prelude::*;
 
 /// A grey picture, `height` rows of `width` values in [0, 1].
@@ -11,6 +14,8 @@ pub struct GrayImage {
     width: usize,
     height: usize,
     pixels: Vec<f32>,
+    /// Pixels in which points may be matched; `None` for all.
+    mask: Option<Mask>,
 }
 
 /// Rec. 709 luma weights, applied to the stored (gamma-encoded) values.
@@ -21,7 +26,29 @@ impl GrayImage {
     /// differs, the picture is empty, or a value is not finite.
     pub fn new(width: usize, height: usize, pixels: Vec<f32>) -> Option<Self> {
         let fits = width.checked_mul(height) == Some(pixels.len()) && !pixels.is_empty();
-        (fits && pixels.iter().all(|v| v.is_finite())).then_some(Self { width, height, pixels })
+        let finite = fits && pixels.iter().all(|v| v.is_finite());
+        finite.then_some(Self { width, height, pixels, mask: None })
+    }
+
+    /// Computes the luma of a picture. With a mask, no points are matched at masked pixels, which are filled from
+    /// those around ([`Mask::filled`]). Returns `None` for a picture whose data do not have its size, or for a mask
+    /// of another size.
+    pub fn from_picture(picture: &Rgb, mask: Option<&Mask>) -> Option<Self> {
+        let Rgb { width, height, data } = picture;
+        match mask {
+            None => Self::from_rgb8(*width, *height, data),
+            Some(mask) if mask.fits(picture) && data.len() == 3 * mask.kept().len() => {
+                let grey = Self::from_rgb8(*width, *height, &mask.filled(picture).data)?;
+                Some(grey.masked(mask.clone()))
+            }
+            Some(_) => None,
+        }
+    }
+
+    /// The picture with a mask of its size; one of another size is ignored.
+    pub(crate) fn masked(self, mask: Mask) -> Self {
+        let fits = (mask.width(), mask.height()) == (self.width, self.height);
+        Self { mask: fits.then_some(mask), ..self }
     }
 
     /// Computes the luma of interleaved 8-bit RGB. Returns `None` where the length is not 3·W·H.
@@ -52,6 +79,11 @@ impl GrayImage {
     /// Returns all values, row-major.
     pub fn pixels(&self) -> &[f32] {
         &self.pixels
+    }
+
+    /// Returns the pixels in which points may be matched; `None` for all.
+    pub(crate) fn mask(&self) -> Option<&Mask> {
+        self.mask.as_ref()
     }
 
     /// Returns row `y`.
@@ -105,7 +137,7 @@ impl GrayImage {
                 accumulate(out, &across[from * w..(from + 1) * w], weight);
             }
         });
-        Self { width: w, height: h, pixels }
+        Self { width: w, height: h, pixels, mask: None }
     }
 
     /// Returns every second pixel of both directions. The source is already blurred for the next
@@ -114,14 +146,14 @@ impl GrayImage {
     pub(crate) fn decimated(&self) -> Self {
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
         let pixels = (0..height).flat_map(|y| self.row(2 * y).iter().step_by(2).copied()).collect();
-        Self { width, height, pixels }
+        Self { width, height, pixels, mask: None }
     }
 
     /// Returns the picture mirrored left to right.
     pub(crate) fn flipped(&self) -> Self {
         let rows = self.pixels.chunks_exact(self.width);
         let pixels = rows.flat_map(|row| row.iter().rev().copied()).collect();
-        Self { pixels, ..*self }
+        Self { pixels, mask: self.mask.as_ref().map(Mask::flipped), ..*self }
     }
 
     /// Doubles the size by bilinear interpolation. The centre of pixel (2i, 2j) is the centre of
@@ -139,7 +171,7 @@ impl GrayImage {
                 *o = 0.25 * (top[l] + top[r] + bottom[l] + bottom[r]);
             }
         });
-        Self { width, height, pixels }
+        Self { width, height, pixels, mask: None }
     }
 
     /// Averages areas down to `width × height`, each at most the size of this picture.
@@ -160,7 +192,7 @@ impl GrayImage {
                 accumulate(out, &across[from * width..(from + 1) * width], weight);
             }
         });
-        Self { width, height, pixels }
+        Self { width, height, pixels, mask: self.mask.as_ref().map(|m| m.resized(width, height)) }
     }
 }
 

@@ -1,12 +1,13 @@
 //! Decoding of picture files to stored sRGB pixels, with the metadata that photographs need.
 //!
 //! Steps: detect the format by content, refuse truncated JPEG files and CMYK of unknown
-//! polarity, decode, convert an embedded ICC profile to sRGB, blend transparency with black,
-//! round to 8 bits.
+//! polarity, decode, convert an embedded ICC profile to sRGB, make a mask of an alpha channel or blend
+//! transparency with black, round to 8 bits.
 
 use super::image::{LoadOptions, MAX_PIXELS, Probe, Truncated};
 use super::{heic, icc, jpeg};
 use crate::files::{Error, Result, read};
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
@@ -26,10 +27,14 @@ const FORMATS: &str = if cfg!(feature = "heic") {
 pub(super) struct Decoded<'a> {
     /// Stored pixels, sRGB.
     pub picture: Rgb,
+    /// Stored pixels that the alpha channel keeps, where it masks some.
+    pub mask: Option<Mask>,
     /// EXIF orientation; `NoTransforms` for HEIC, whose decoder applies the file's rotation.
     pub orientation: Orientation,
     /// EXIF block: a TIFF structure.
     pub exif: Option<Cow<'a, [u8]>>,
+    /// The metadata state an equirectangular panorama.
+    pub panorama: bool,
     /// Warnings for the user, with the file's path.
     pub warnings: Vec<String>,
 }
@@ -40,6 +45,8 @@ pub(super) struct Header {
     pub probe: Probe,
     /// EXIF block: a TIFF structure.
     pub exif: Option<Vec<u8>>,
+    /// The metadata state an equirectangular panorama.
+    pub panorama: bool,
 }
 
 /// A decoder of the `image` crate, and the file's format.
@@ -121,7 +128,8 @@ pub(super) fn header(path: &Path) -> Result<Header> {
     };
     let orientation = (orientation > 1).then_some(orientation);
     let probe = Probe { width: width as usize, height: height as usize, orientation };
-    Ok(Header { probe, exif })
+    let panorama = is_panorama(&mut *decoder);
+    Ok(Header { probe, exif, panorama })
 }
 
 /// Decodes the bytes of a picture file; `path` is for messages.
@@ -132,6 +140,7 @@ pub(super) fn decode<'a>(
 ) -> Result<Decoded<'a>> {
     let mut warnings = Vec::new();
     let heic = is_heic(bytes, path)?;
+    let mut panorama = false;
     let (mut pixels, profile, orientation, exif) = if heic {
         let heic::Pixels { pixels, profile, exif } = heic::decode(bytes, path, &mut warnings)?;
         (pixels, profile, Orientation::NoTransforms, exif.map(Cow::Owned))
@@ -149,6 +158,7 @@ pub(super) fn decode<'a>(
             ImageFormat::Tiff => Some(Cow::Borrowed(bytes)),
             _ => decoder.exif_metadata().ok().flatten().map(Cow::Owned),
         };
+        panorama = is_panorama(&mut *decoder);
         let pixels = DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?;
         (pixels, profile, orientation, exif)
     };
@@ -160,7 +170,17 @@ pub(super) fn decode<'a>(
             path.display()
         ));
     }
-    Ok(Decoded { picture: to_rgb(pixels), orientation, exif, warnings })
+    let (picture, mask) = to_rgb(pixels);
+    Ok(Decoded { picture, mask, orientation, exif, panorama, warnings })
+}
+
+/// Returns whether the XMP block states an equirectangular panorama: GPano's `ProjectionType`, which cameras,
+/// phones and stitchers write (Google, "Photo Sphere XMP Metadata").
+fn is_panorama(decoder: &mut dyn ImageDecoder) -> bool {
+    let block = decoder.xmp_metadata().ok().flatten().unwrap_or_default();
+    let text = String::from_utf8_lossy(&block);
+    let value = text.split("ProjectionType").nth(1).unwrap_or_default();
+    value.trim_start_matches(['=', '>', '"', '\'', ' ']).starts_with("equirectangular")
 }
 
 /// Checks what the JPEG decoder does not: the end of the file and the kind of CMYK.
@@ -205,17 +225,34 @@ fn check_jpeg(
     Ok(())
 }
 
-/// Blends transparency with black and rounds to 8 bits.
-fn to_rgb(pixels: DynamicImage) -> Rgb {
+/// Least alpha of a pixel that counts.
+const ALPHA_KEPT: u8 = 128;
+
+/// Rounds to 8 bits, and makes a mask of an alpha channel. An alpha of 0 everywhere is no alpha: some writers
+/// of BMP and TIFF leave a fourth band of zeros. A mask is an alpha that is not the same everywhere and masks
+/// a pixel. Transparency is blended with black, but for pixels that a mask keeps: those at the rim of an
+/// object would be darker than it.
+fn to_rgb(pixels: DynamicImage) -> (Rgb, Option<Mask>) {
     let (width, height) = (pixels.width() as usize, pixels.height() as usize);
-    let data = if pixels.color().has_alpha() {
-        let rgba = pixels.into_rgba8().into_raw();
-        let over_black = |v: u8, a: u8| ((u32::from(v) * u32::from(a) + 127) / 255) as u8;
-        rgba.chunks_exact(4)
-            .flat_map(|p| [over_black(p[0], p[3]), over_black(p[1], p[3]), over_black(p[2], p[3])])
-            .collect()
-    } else {
-        pixels.into_rgb8().into_raw()
+    let opaque =
+        |pixels: DynamicImage| (Rgb { width, height, data: pixels.into_rgb8().into_raw() }, None);
+    if !pixels.color().has_alpha() {
+        return opaque(pixels);
+    }
+    let rgba = pixels.to_rgba8().into_raw();
+    let alphas = || rgba.chunks_exact(4).map(|p| p[3]);
+    let [least, most] = alphas().fold([u8::MAX, 0], |[least, most], a| [least.min(a), most.max(a)]);
+    if most == 0 {
+        return opaque(pixels);
+    }
+    let masks = least < ALPHA_KEPT && least < most;
+    let over_black = |v: u8, a: u8| ((u32::from(v) * u32::from(a) + 127) / 255) as u8;
+    let blend = |p: &[u8]| {
+        let alpha = if masks && p[3] >= ALPHA_KEPT { u8::MAX } else { p[3] };
+        [over_black(p[0], alpha), over_black(p[1], alpha), over_black(p[2], alpha)]
     };
-    Rgb { width, height, data }
+    let data = rgba.chunks_exact(4).flat_map(blend).collect();
+    let kept = || alphas().map(|alpha| alpha >= ALPHA_KEPT).collect();
+    let mask = if masks { Mask::new(width, height, kept()) } else { None };
+    (Rgb { width, height, data }, mask)
 }

@@ -98,7 +98,7 @@ mod supported {
         let (width, height) = (info.width as usize, info.height as usize);
         let probe = Probe { width, height, orientation: None };
         let context = Context::open(bytes).map_err(|e| refused(path, &e))?;
-        Ok(Header { probe, exif: exif(&context) })
+        Ok(Header { probe, exif: exif(&context), panorama: false })
     }
 
     /// A picture with a malformed EXIF block still decodes.

@@ -10,6 +10,7 @@
 
 use super::decode::{self, decode, decoder};
 use crate::files::{Error, Result, read, write_atomic};
+use crate::scene::mask::Mask;
 use crate::scene::pictures::{Depth, Rgb};
 use std::io::Write;
 use std::path::Path;
@@ -64,6 +65,8 @@ pub struct LoadOptions {
 pub struct LoadedPicture {
     /// Stored pixels, sRGB.
     pub picture: Rgb,
+    /// Pixels that the alpha channel keeps: those of an alpha from 128. `None` without one that masks pixels.
+    pub mask: Option<Mask>,
     /// Warnings for the user, one line each, with the file's path.
     pub warnings: Vec<String>,
 }
@@ -77,8 +80,8 @@ pub fn probe(path: impl AsRef<Path>) -> Result<Probe> {
 }
 
 /// Decodes a picture. Grey becomes three equal channels, 16 bits are rounded to 8, and
-/// transparency is blended with black, the renderer's background. An ICC profile other than
-/// sRGB's is applied. The rotation and the mirroring of a HEIC file belong to its format and
+/// transparency is blended with black, the renderer's background, but for pixels of an alpha from 128
+/// beside masked ones ([`LoadedPicture::mask`]). An ICC profile other than sRGB's is applied. The rotation and the mirroring of a HEIC file belong to its format and
 /// are applied as well.
 ///
 /// # Errors
@@ -96,7 +99,7 @@ pub fn load_with(path: impl AsRef<Path>, options: &LoadOptions) -> Result<Loaded
     let path = path.as_ref();
     let bytes = read(path)?;
     let decoded = decode(&bytes, options, path)?;
-    Ok(LoadedPicture { picture: decoded.picture, warnings: decoded.warnings })
+    Ok(LoadedPicture { picture: decoded.picture, mask: decoded.mask, warnings: decoded.warnings })
 }
 
 /// Decodes bytes in memory as [`load`] does; `path` is for errors.

@@ -2,10 +2,12 @@
 
 mod decode;
 pub mod exif;
+pub mod folder;
 mod heic;
 mod icc;
 pub mod image;
 mod jpeg;
+pub(in crate::files) mod masks;
 pub mod photograph;
 pub mod resize;
 mod rgb_image;

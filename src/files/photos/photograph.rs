@@ -9,8 +9,10 @@
 use super::decode::{self, Header, decode};
 use super::exif::{ExifCamera, ExifReport, parse_exif};
 use super::image::{LoadOptions, Probe};
+use super::masks;
 use crate::files::poses::assemble::list_images;
 use crate::files::{Error, Result, read};
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use image::metadata::Orientation;
 use image::{DynamicImage, RgbImage};
@@ -22,6 +24,10 @@ use subsplat_kernels::camera::Intrinsics;
 pub struct Photograph {
     /// Upright pixels, sRGB.
     pub image: Rgb,
+    /// Pixels that count, of [`Photograph::image`]; `None` where all do. It comes from the alpha channel (128
+    /// and above is kept), and from a file in a folder `masks` beside `images` or among the photographs:
+    /// `masks/NAME.jpg.png` or `masks/NAME.png`, 0 is masked.
+    pub mask: Option<Mask>,
     /// The EXIF orientation that was applied, 2 to 8; `None` if the stored pixels are upright.
     pub orientation: Option<u8>,
     /// The camera of the EXIF block. Its focal length is in px of [`Photograph::image`].
@@ -58,7 +64,20 @@ impl Photograph {
     pub fn from_pixels(image: impl Into<Rgb>) -> Self {
         let image = image.into();
         let camera = ExifCamera::default();
-        Self { image, orientation: None, camera, warnings: Vec::new() }
+        Self { image, mask: None, orientation: None, camera, warnings: Vec::new() }
+    }
+
+    /// The same photograph with a mask of its pixels, in place of its own one.
+    ///
+    /// # Errors
+    /// A mask of another size than the photograph's, or that keeps no pixel.
+    pub fn with_mask(self, mask: Mask) -> Result<Self> {
+        if !mask.fits(&self.image) {
+            let expected = format!("a mask of {}x{}", self.image.width, self.image.height);
+            let got = format!("{}x{}", mask.width(), mask.height());
+            return Err(Error::format("photograph", expected, got));
+        }
+        Ok(Self { mask: masks::checked(Some(mask), Path::new("photograph"))?, ..self })
     }
 
     /// Returns intrinsics of EXIF's focal length, px, with the principal point in the middle;
@@ -89,23 +108,25 @@ pub fn list_photographs(folder: impl AsRef<Path>) -> Vec<PathBuf> {
 /// Those of [`super::image::probe`]; a DNG raw file.
 pub fn probe_photograph(path: impl AsRef<Path>) -> Result<PhotographHeader> {
     let path = path.as_ref();
-    let Header { probe, exif } = decode::header(path)?;
+    let Header { probe, exif, panorama } = decode::header(path)?;
     let orientation = probe.orientation;
     let Probe { width, height, .. } = probe.upright();
-    let ExifReport { camera, warnings, .. } = report(exif.as_deref(), width, height, path)?;
+    let ExifReport { camera, warnings, .. } =
+        report(exif.as_deref(), panorama, width, height, path)?;
     Ok(PhotographHeader { width, height, orientation, camera, warnings })
 }
 
-/// Decodes a photograph and turns it upright.
+/// Decodes a photograph with its mask and turns it upright. A mask file that is missing, cannot be read or has
+/// another shape gives a warning.
 ///
 /// # Errors
-/// Those of [`super::image::load_with`]; a DNG raw file.
+/// Those of [`super::image::load_with`]; a DNG raw file; a photograph that is masked entirely.
 pub fn load_photograph(path: impl AsRef<Path>, options: &LoadOptions) -> Result<Photograph> {
     let path = path.as_ref();
-    parse_photograph(&read(path)?, options, path)
+    decode_upright(&read(path)?, options, path, masks::of_photograph(path).as_deref())
 }
 
-/// Decodes bytes in memory as [`load_photograph`] does; `path` is for messages.
+/// Decodes bytes in memory as [`load_photograph`] does, without a mask file; `path` is for messages.
 ///
 /// # Errors
 /// As [`load_photograph`].
@@ -114,18 +135,37 @@ pub fn parse_photograph(
     options: &LoadOptions,
     path: impl AsRef<Path>,
 ) -> Result<Photograph> {
-    decode_upright(bytes, options, path.as_ref())
+    decode_upright(bytes, options, path.as_ref(), None)
 }
 
-fn decode_upright(bytes: &[u8], options: &LoadOptions, path: &Path) -> Result<Photograph> {
+fn decode_upright(
+    bytes: &[u8],
+    options: &LoadOptions,
+    path: &Path,
+    mask_file: Option<&Path>,
+) -> Result<Photograph> {
     let decoded = decode(bytes, options, path)?;
     let Rgb { width, height, .. } = decoded.picture;
-    let report = report(decoded.exif.as_deref(), width, height, path)?;
+    let report = report(decoded.exif.as_deref(), decoded.panorama, width, height, path)?;
     let image = upright(decoded.picture, decoded.orientation)?;
     let orientation = Some(decoded.orientation.to_exif()).filter(|o| *o > 1);
     let mut warnings = decoded.warnings;
     warnings.extend(report.warnings);
-    Ok(Photograph { image, orientation, camera: report.camera, warnings })
+    let probe = Probe { width, height, orientation };
+    let mask = match mask_file.map(|file| masks::load(file, &probe)) {
+        Some(Ok(mask)) => masks::both(decoded.mask, Some(mask)),
+        Some(Err(error)) => {
+            warnings.push(format!("{}: all of its pixels are used: {error}", path.display()));
+            decoded.mask
+        }
+        None => decoded.mask,
+    };
+    let mask = mask.and_then(|mask| match orientation {
+        Some(_) => masks::oriented(&mask, decoded.orientation),
+        None => Some(mask),
+    });
+    let mask = masks::checked(mask, path)?;
+    Ok(Photograph { image, mask, orientation, camera: report.camera, warnings })
 }
 
 /// Applies an EXIF orientation.
@@ -138,14 +178,38 @@ fn upright(picture: Rgb, orientation: Orientation) -> Result<Rgb> {
     Ok(pixels.into_rgb8().into())
 }
 
-/// Reads the EXIF block and adds the path to its warnings.
-fn report(block: Option<&[u8]>, width: usize, height: usize, path: &Path) -> Result<ExifReport> {
+/// Least width of a picture that may be a panorama, px.
+const PANORAMA_MIN: usize = 1000;
+
+/// Reads the EXIF block and adds the path to its warnings. A panorama, of which `panorama` says that the file
+/// states it, has no focal length and is refused.
+fn report(
+    block: Option<&[u8]>,
+    panorama: bool,
+    width: usize,
+    height: usize,
+    path: &Path,
+) -> Result<ExifReport> {
+    if panorama {
+        return Err(Error::format(
+            path,
+            "a photograph with straight lines",
+            "a panorama (equirectangular): save pictures of it that are 90 degrees wide, as panorama programs \
+             do, and give these with --fov 90",
+        ));
+    }
     let mut report = block.map(|b| parse_exif(b, width, height)).unwrap_or_default();
     if report.raw {
         return Err(Error::format(
             path,
             "a developed photograph (JPEG, HEIC, PNG, TIFF)",
             "a DNG raw file (develop it to JPEG first)",
+        ));
+    }
+    if width == 2 * height && width >= PANORAMA_MIN && report.camera.focal.is_none() {
+        report.warnings.push(format!(
+            "{width}x{height} pixels are the shape of a panorama, which is read wrongly as a photograph: save \
+             pictures of it that are 90 degrees wide"
         ));
     }
     for warning in &mut report.warnings {

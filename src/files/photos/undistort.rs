@@ -12,6 +12,7 @@
 //! picture has no black border and keeps its aspect. Sampling is bicubic (a = −½), clamped
 //! at the photograph's edge.
 
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
@@ -192,14 +193,51 @@ pub fn undistort(photo: &Rgb, from: &Intrinsics, distortion: &Distortion, to: &I
     }
     out.data.par_chunks_mut(3 * to.width).enumerate().for_each(|(y, line)| {
         for (x, pixel) in line.chunks_exact_mut(3).enumerate() {
-            let r = ray(to, DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
-            let seen = distortion.distort_f64(r);
-            let u = f64::from(from.fx) * seen.x + f64::from(from.cx);
-            let v = f64::from(from.fy) * seen.y + f64::from(from.cy);
+            let px = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+            let [u, v] = source(px, from, distortion, to);
             pixel.copy_from_slice(&sample(photo, u as f32, v as f32));
         }
     });
     out
+}
+
+/// [`undistort`] of a photograph with a mask of its pixels. A pixel has the mask of the photograph's pixel at
+/// its place. What is masked does not mix into pixels that count: the interpolation reads the colours around
+/// instead ([`Mask::filled`]).
+pub fn undistort_masked(
+    photo: &Rgb,
+    mask: &Mask,
+    from: &Intrinsics,
+    distortion: &Distortion,
+    to: &Intrinsics,
+) -> (Rgb, Option<Mask>) {
+    let mut out = undistort(photo, from, distortion, to);
+    if !mask.fits(photo) {
+        return (out, None);
+    }
+    let at = |i: usize| {
+        let px = DVec2::new((i % to.width) as f64 + 0.5, (i / to.width) as f64 + 0.5);
+        let [u, v] = source(px, from, distortion, to);
+        // `as` saturates: any position gives a valid index.
+        let (x, y) = ((u as usize).min(mask.width() - 1), (v as usize).min(mask.height() - 1));
+        mask.kept()[y * mask.width() + x]
+    };
+    let kept: Vec<bool> = (0..to.width * to.height).into_par_iter().map(at).collect();
+    let clean = undistort(&mask.filled(photo), from, distortion, to);
+    let pixels = out.data.chunks_exact_mut(3).zip(clean.data.chunks_exact(3));
+    for ((pixel, clean), _) in pixels.zip(&kept).filter(|(_, kept)| **kept) {
+        pixel.copy_from_slice(clean);
+    }
+    (out, Mask::new(to.width, to.height, kept))
+}
+
+/// Position in the photograph that pixel position `px` of the pinhole `to` shows, px.
+fn source(px: DVec2, from: &Intrinsics, distortion: &Distortion, to: &Intrinsics) -> [f64; 2] {
+    let seen = distortion.distort_f64(ray(to, px));
+    [
+        f64::from(from.fx) * seen.x + f64::from(from.cx),
+        f64::from(from.fy) * seen.y + f64::from(from.cy),
+    ]
 }
 
 /// Computes the weights of the neighbours at −1, 0, 1, 2 of a position `t` in [0, 1) (cubic
@@ -367,6 +405,36 @@ mod tests {
                     assert!(got.abs_diff(want) <= 2, "{lens:?} at {at}: {got} not {want}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn masked_pixels_do_not_mix_into_the_others() {
+        for lens in lenses() {
+            let new = pinhole(&K, &lens).unwrap();
+            let mut photo = Rgb { data: vec![90; 3 * 320 * 240], ..Rgb::black(320, 240) };
+            let masked = |x: f64, y: f64| (x - 130.0).hypot(y - 100.0) < 50.0;
+            let kept: Vec<bool> = (0..320 * 240)
+                .map(|i| !masked((i % 320) as f64 + 0.5, (i / 320) as f64 + 0.5))
+                .collect();
+            for (pixel, kept) in photo.data.chunks_exact_mut(3).zip(&kept) {
+                if !kept {
+                    pixel.fill(255);
+                }
+            }
+            let mask = Mask::new(320, 240, kept).unwrap();
+            let (out, moved) = undistort_masked(&photo, &mask, &K, &lens, &new);
+            let moved = moved.unwrap();
+            let mut counts = [0, 0];
+            for (i, (pixel, kept)) in out.data.chunks_exact(3).zip(moved.kept()).enumerate() {
+                let r = ray(&new, DVec2::new((i % 320) as f64 + 0.5, (i / 320) as f64 + 0.5));
+                let seen = lens.distort_f64(r);
+                let distance = (200.0 * seen.x + 155.0 - 130.0).hypot(210.0 * seen.y + 22.0);
+                assert!((distance - 50.0).abs() < 1.0 || *kept == (distance > 50.0));
+                assert!(!kept || pixel == [90; 3], "{lens:?} {i}: {pixel:?}");
+                counts[usize::from(*kept)] += 1;
+            }
+            assert!(counts[0] > 2000 && counts[1] > 20_000, "{counts:?}");
         }
     }
 

@@ -3,12 +3,14 @@
 
 use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
 use crate::files::photos::image::{Probe, probe};
+use crate::files::photos::masks;
 use crate::files::photos::undistort::Distortion;
 use crate::files::{Error, Result};
-use glam::{DMat3, DMat4};
+use glam::{DMat3, DMat4, DVec3};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use subsplat_kernels::camera::{Camera, CameraError, Intrinsics};
+use unicode_normalization::UnicodeNormalization;
 
 /// Intrinsics in the form of a pose file.
 #[derive(Clone, Copy, Debug)]
@@ -20,7 +22,7 @@ pub(super) enum Lens {
 }
 
 /// A frame before its picture's header is read.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(super) struct Draft {
     /// Place in the pose file, in the form of [`Error::at`].
     pub place: String,
@@ -28,6 +30,8 @@ pub(super) struct Draft {
     pub file: String,
     /// Path of the picture on disk, `None` if there is none.
     pub image: Option<PathBuf>,
+    /// Reason for which the entry has no camera.
+    pub refused: Option<Error>,
     /// Pixels to which the intrinsics refer.
     pub pixels: Pixels,
     /// Intrinsics.
@@ -42,6 +46,8 @@ pub(super) struct Draft {
     pub timestamp: Option<i64>,
     /// See [`Frame`].
     pub depth: Option<PathBuf>,
+    /// See [`Frame`]. The file may be missing.
+    pub mask: Option<PathBuf>,
     /// See [`Frame`].
     pub visible: Vec<u32>,
 }
@@ -52,6 +58,7 @@ impl Draft {
             place,
             file,
             image: None,
+            refused: None,
             pixels: Pixels::Stored,
             lens,
             size: None,
@@ -59,20 +66,29 @@ impl Draft {
             distortion: Distortion::None,
             timestamp: None,
             depth: None,
+            mask: None,
             visible: Vec::new(),
         }
+    }
+
+    /// An entry of a pose file that has no camera, because of `error`.
+    pub fn refused(file: String, error: Error) -> Self {
+        let draft = Self::new(String::new(), file, Lens::Pixels([0.0; 4]), DMat4::IDENTITY);
+        Self { refused: Some(error), ..draft }
     }
 }
 
 /// Extensions tried where a pose file names a picture without one (NeRF's blender
 /// scenes, some nerfstudio exports).
-pub(super) const EXTENSIONS: [&str; 14] = [
+pub(super) const EXTENSIONS: [&str; 18] = [
     "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "TIF", "bmp", "BMP", "heic",
-    "HEIC",
+    "HEIC", "jfif", "jpe", "heif", "hif",
 ];
 
-/// Searches for a picture below `roots`, with and without `images/` between.
-pub(super) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
+/// Searches for a picture below `roots`, with and without a folder of pictures between: `images`, or reduced
+/// copies as `images_4`. A name that differs in case, in the form of its accents or in the extension is found
+/// where it is the only one.
+pub(in crate::files) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
     let name = name.replace('\\', "/");
     let name = name.trim_start_matches("./");
     if name.is_empty() {
@@ -86,7 +102,49 @@ pub(super) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
     candidates
         .next()
         .or_else(|| places.iter().flat_map(|p| with_extensions(p)).find(|p| p.is_file()))
+        .or_else(|| places.iter().find_map(|p| similar(p)))
+        .or_else(|| in_reduced_copies(roots, name))
         .or_else(|| places.iter().find(|p| p.exists()).cloned())
+}
+
+/// The picture among reduced copies, which COLMAP's and nerfstudio's scenes have in `images_2` to `images_8`.
+fn in_reduced_copies(roots: &[&Path], name: &str) -> Option<PathBuf> {
+    let name = name.trim_start_matches("images/");
+    let copies = [2, 4, 8].map(|n| format!("images_{n}"));
+    let places = roots.iter().flat_map(|r| copies.iter().map(|copy| r.join(copy).join(name)));
+    let places: Vec<PathBuf> = places.collect();
+    let found = places.iter().find(|p| p.is_file()).cloned();
+    found.or_else(|| places.iter().find_map(|p| similar(p)))
+}
+
+/// The only picture in the folder of `place` whose name is that of `place` but for case, the form of accents
+/// and the extension.
+fn similar(place: &Path) -> Option<PathBuf> {
+    let wanted = similar_key(place);
+    let mut all =
+        std::fs::read_dir(place.parent()?).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    let matches = |path: &PathBuf| has_extension(path) && similar_key(path) == wanted;
+    let found = all.by_ref().find(matches)?;
+    (!all.any(|path| matches(&path))).then_some(found)
+}
+
+/// A file's name without a picture's extension, in lower case and with composed accents.
+fn similar_key(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let name: String = name.nfc().flat_map(char::to_lowercase).collect();
+    match name.rsplit_once('.') {
+        Some((stem, extension)) if is_extension(extension) => stem.to_owned(),
+        _ => name,
+    }
+}
+
+/// Returns whether `extension` is one of [`EXTENSIONS`], in any case.
+fn is_extension(extension: &str) -> bool {
+    EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(extension))
+}
+
+fn has_extension(path: &Path) -> bool {
+    is_extension(&path.extension().unwrap_or_default().to_string_lossy())
 }
 
 fn with_extensions(place: &Path) -> impl Iterator<Item = PathBuf> + '_ {
@@ -126,19 +184,26 @@ fn numeric_key(path: &Path) -> Vec<NamePart> {
     key
 }
 
-/// Lists the pictures of a folder, sorted by name with numbers in numeric order; empty if
-/// there is no such folder.
+/// Lists the files of a folder with a picture's extension, sorted by name with numbers in numeric order;
+/// empty if there is no such folder. Files that macOS writes beside others (`._a.jpg`) are none.
 pub(in crate::files) fn list_images(folder: &Path) -> Vec<PathBuf> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
-    let is_picture = |p: &PathBuf| {
-        let extension = p.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        EXTENSIONS.contains(&extension.as_str())
-    };
-    let mut images: Vec<PathBuf> =
-        entries.filter_map(|e| Some(e.ok()?.path())).filter(is_picture).collect();
-    // The path decides between `01.png` and `1.png`.
-    images.sort_by_cached_key(|p| (numeric_key(p), p.clone()));
+    let mut images = files(folder);
+    images.retain(|path| has_extension(path));
     images
+}
+
+/// Lists the files of a folder without hidden ones, sorted by name with numbers in numeric order.
+pub(in crate::files) fn files(folder: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let hidden =
+        |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
+    let mut files: Vec<PathBuf> = entries
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.is_file() && !hidden(path))
+        .collect();
+    // The path decides between `01.png` and `1.png`.
+    files.sort_by_cached_key(|p| (numeric_key(p), p.clone()));
+    files
 }
 
 /// A pose after [`orthonormal`].
@@ -235,36 +300,78 @@ pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Err
     Error::format(path, expected, got).at(place)
 }
 
-/// Makes frames of drafts: reads the header of every picture and checks every camera. A
-/// missing picture gives a warning and no frame. A picture of another shape than its camera's gives
-/// a warning and a frame that cannot be loaded, so that the indices of the others stay.
-pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> Result<Scene> {
+/// Makes frames of drafts: reads the header of every picture and checks every camera. An entry without a
+/// camera, or whose picture is missing or cannot be read, gives a warning and no frame. A picture of another
+/// shape than its camera's gives a warning and a frame that cannot be loaded, so that the indices of the others
+/// stay. Fewer than two frames that can be loaded are an error where an entry is to blame.
+pub(super) fn assemble(
+    path: &Path,
+    source: SceneFormat,
+    pictures: Pictures,
+    mut drafts: Vec<Draft>,
+) -> Result<Scene> {
     if drafts.is_empty() {
         return Err(Error::format(path, "at least one frame", "none"));
     }
-    let probes: Vec<Option<Result<Probe>>> =
-        drafts.par_iter().map(|d| d.image.as_deref().map(|image| size(image, d.pixels))).collect();
+    let origin = origin_of(&drafts);
+    drafts.iter_mut().for_each(|d| d.world_from_camera.w_axis -= origin.extend(0.0));
+    let probe = |d: &Draft| match (&d.image, pictures, d.size) {
+        (Some(image), Pictures::Needed, _) => Some(size(image, d.pixels)),
+        (_, Pictures::Unread, Some((width, height))) => {
+            Some(Ok(Probe { width, height, orientation: None }))
+        }
+        _ => None,
+    };
+    let probes: Vec<Option<Result<Probe>>> = drafts.par_iter().map(probe).collect();
     let count = drafts.len();
     let mut notes = Notes::default();
     let mut frames: Vec<Frame> = Vec::with_capacity(count);
-    for (draft, stored) in drafts.into_iter().zip(probes) {
-        let (Some(image), Some(stored)) = (draft.image.clone(), stored) else {
-            notes.missing.push(draft.file);
-            continue;
+    for (mut draft, stored) in drafts.into_iter().zip(probes) {
+        let file = draft.file.clone();
+        let made = match (draft.refused.take(), stored) {
+            (Some(error), _) | (None, Some(Err(error))) => Err(error),
+            (None, Some(Ok(stored))) => {
+                let image = draft.image.clone().unwrap_or_default();
+                frame(path, draft, image, &stored, &mut notes)
+            }
+            (None, None) => {
+                notes.missing.push(file);
+                continue;
+            }
         };
-        frames.push(frame(path, draft, image, &stored?, &mut notes)?);
+        match made {
+            Ok(frame) => frames.push(frame),
+            Err(error) => notes.refuse(&file, error),
+        }
+    }
+    if source == SceneFormat::Photographs {
+        // The photographs' loader has said so.
+        notes.unmasked.clear();
+    }
+    // A reconstruction needs two, and every camera of a command line is meant to be used.
+    let usable = frames.iter().filter(|f| f.other_shape.is_none()).count();
+    let enough = usable > 1 || (usable > 0 && pictures == Pictures::Unread);
+    if (!enough || !source.has_file())
+        && let Some(error) = notes.refused_error.take().or(notes.other_shape_error.take())
+    {
+        return Err(error);
     }
     if frames.is_empty() {
         let first = notes.missing.first().cloned().unwrap_or_default();
         let got = format!("none of {count} (the first is `{first}`)");
-        return Err(Error::format(path, "pictures on disk", got));
+        let expected = match pictures {
+            Pictures::Needed => "pictures on disk",
+            Pictures::Unread => "cameras with the size of their pictures",
+        };
+        return Err(Error::format(path, expected, got));
     }
-    // A reconstruction needs two, and every camera of a command line is meant to be used.
-    let usable = frames.iter().filter(|f| f.other_shape.is_none()).count();
-    if (usable < 2 || !source.has_file())
-        && let Some(error) = notes.other_shape_error.take()
-    {
-        return Err(error);
+    let mut warnings = notes.lines(count);
+    if origin != DVec3::ZERO {
+        let [x, y, z] = origin.to_array();
+        warnings.push(format!(
+            "the cameras lie far from the origin of their world, where 32-bit numbers are too coarse: the \
+             coordinates of this scene are relative to ({x}, {y}, {z})"
+        ));
     }
     Ok(Scene {
         name: scene_name(path),
@@ -273,8 +380,37 @@ pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> 
         source,
         units: Units::Unknown,
         near_far: None,
-        warnings: notes.lines(count),
+        origin,
+        warnings,
     })
+}
+
+/// Whether a scene's pictures are needed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Pictures {
+    /// Frames without a picture are left out.
+    Needed,
+    /// No picture is read: cameras have the sizes that the file states.
+    Unread,
+}
+
+/// Distance of the cameras' middle from the origin of their world, in units of their spread, from which on the
+/// middle becomes the origin. At this distance an f32 is wrong by 1.2e-5 of the spread.
+const FAR: f64 = 200.0;
+
+/// The origin of a scene, world units: zero, or the middle of the cameras in whole units where it is [`FAR`]
+/// away, as in the coordinates of a survey (UTM).
+pub(super) fn origin_of(drafts: &[Draft]) -> DVec3 {
+    let cameras = drafts.iter().filter(|d| d.refused.is_none());
+    let at: Vec<DVec3> = cameras
+        .map(|d| d.world_from_camera.w_axis.truncate())
+        .filter(|position| position.is_finite())
+        .collect();
+    let middle = at.iter().sum::<DVec3>() / at.len().max(1) as f64;
+    let spread = at.iter().map(|p| p.distance(middle)).fold(0.0, f64::max);
+    // One camera, or several at one place, have no spread.
+    let unit = if spread > 0.0 { spread } else { FAR };
+    if middle.length() > FAR * unit { middle.round() } else { DVec3::ZERO }
 }
 
 /// Reads the size of the pixels to which a camera refers.
@@ -328,10 +464,9 @@ fn frame(
     if let Err(e) = draft.distortion.check() {
         return bad("finite distortion coefficients".to_owned(), e);
     }
-    let name = draft.file.replace('\\', "/");
-    let name = name.trim_start_matches("./").trim_start_matches("images/");
+    let mask = mask(&draft, &image, stored, notes);
     Ok(Frame {
-        name: Path::new(name).with_extension("").to_string_lossy().into_owned(),
+        name: frame_name(&draft.file),
         image,
         pixels: draft.pixels,
         camera,
@@ -339,13 +474,46 @@ fn frame(
         other_shape,
         timestamp: draft.timestamp,
         depth: draft.depth,
+        mask,
         visible: draft.visible,
     })
+}
+
+/// The mask of a picture; `None` without one that can be used.
+fn mask(draft: &Draft, image: &Path, stored: &Probe, notes: &mut Notes) -> Option<PathBuf> {
+    let file = draft.mask.clone().or_else(|| masks::of_photograph(image))?;
+    // A camera alone needs no mask.
+    if !image.is_file() {
+        return None;
+    }
+    let checked = match draft.pixels {
+        Pixels::Stored => masks::check(&file, stored),
+        Pixels::Upright => probe(image).and_then(|stored| masks::check(&file, &stored)),
+    };
+    if checked.is_err() {
+        notes.unmasked.push(draft.file.clone());
+    }
+    checked.is_ok().then_some(file)
+}
+
+/// A picture's path in a pose file without `images/` and without the extension of a picture: a name without
+/// one may have dots.
+pub(super) fn frame_name(file: &str) -> String {
+    let name = file.replace('\\', "/");
+    let name = name.trim_start_matches("./").trim_start_matches("images/");
+    match name.rsplit_once('.') {
+        Some((stem, extension)) if is_extension(extension) && !stem.is_empty() => stem.to_owned(),
+        _ => name.to_owned(),
+    }
 }
 
 /// Files that give warnings, one line for each kind.
 #[derive(Default)]
 struct Notes {
+    /// Entries without a frame, with the reason.
+    refused: Vec<String>,
+    /// Error of the first of them.
+    refused_error: Option<Error>,
     missing: Vec<String>,
     other_shape: Vec<String>,
     /// Error of the first frame of `other_shape`.
@@ -353,11 +521,26 @@ struct Notes {
     with_orientation: Vec<String>,
     rescaled: Vec<String>,
     skewed: Vec<String>,
+    unmasked: Vec<String>,
 }
 
 impl Notes {
+    fn refuse(&mut self, file: &str, error: Error) {
+        let reason = match &error {
+            Error::Format { path, at, expected, got } => {
+                let name = path.file_name().unwrap_or_default().to_string_lossy();
+                let place = if at.is_empty() { String::new() } else { format!("{name}{at}: ") };
+                format!("{place}expected {expected}, got {got}")
+            }
+            Error::Io { source, .. } => source.to_string(),
+        };
+        self.refused.push(format!("{file} ({reason})"));
+        self.refused_error.get_or_insert(error);
+    }
+
     fn lines(&self, count: usize) -> Vec<String> {
         let kinds = [
+            (&self.refused, "are left out"),
             (&self.missing, "have no picture on disk and are left out"),
             (
                 &self.other_shape,
@@ -369,6 +552,11 @@ impl Notes {
             ),
             (&self.rescaled, "are stored at another size than the pose file's: intrinsics scaled"),
             (&self.skewed, "have a rotation that is not orthonormal (0.1 % to 1 %): corrected"),
+            (
+                &self.unmasked,
+                "have a mask that is missing, cannot be read or has another shape: all of their \
+                 pixels are used",
+            ),
         ];
         let line = |(files, what): (&Vec<String>, &str)| {
             let few: Vec<&str> = files.iter().take(3).map(String::as_str).collect();

@@ -18,10 +18,13 @@
 //! The list of 3DGS has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (of the camera): the same axes, principal point in the middle.
 
-use super::assemble::{Draft, Lens, assemble, camera_error, find_image, orthonormal};
+use super::assemble::{
+    Draft, Lens, Pictures, assemble, camera_error, find_image, origin_of, orthonormal,
+};
+use super::json;
 use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
 use crate::files::{Error, Result, read, write_atomic};
-use glam::{DMat4, DVec4, Vec3};
+use glam::{DMat4, DVec3, DVec4, Vec3};
 use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::Path;
@@ -49,7 +52,7 @@ pub struct NamedCamera {
 }
 
 /// Content of a `cameras.json`.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct CameraFile {
     /// Cameras in the file's order.
     pub cameras: Vec<NamedCamera>,
@@ -57,6 +60,8 @@ pub struct CameraFile {
     pub units: Units,
     /// Nearest and farthest depth of the scene, camera z in world units.
     pub near_far: Option<NearFar>,
+    /// Point of another world that is the origin of these cameras ([`Scene::origin`]).
+    pub origin: DVec3,
 }
 
 /// Fields of the file that concern all frames.
@@ -64,7 +69,9 @@ pub struct CameraFile {
 struct FileInfo {
     units: Units,
     near_far: Option<NearFar>,
-    points: Option<Vec<Vec3>>,
+    points: Option<Vec<DVec3>>,
+    /// Point of the first world that is the origin of this file's.
+    origin: DVec3,
 }
 
 #[derive(Deserialize)]
@@ -75,7 +82,8 @@ struct InFile {
     metric: bool,
     near: Option<f32>,
     far: Option<f32>,
-    points: Option<Vec<[f32; 3]>>,
+    points: Option<Vec<[f64; 3]>>,
+    origin: Option<[f64; 3]>,
     frames: Vec<InFrame>,
 }
 
@@ -89,6 +97,7 @@ struct InFrame {
     fy: f64,
     cx: f64,
     cy: f64,
+    #[serde(deserialize_with = "json::rows")]
     c2w: Vec<Vec<f64>>,
     timestamp_us: Option<i64>,
     re10k_frame: Option<i64>,
@@ -117,6 +126,8 @@ struct OutFile<'a> {
     near: Option<f32>,
     #[serde(skip_serializing_if = "Option::is_none")]
     far: Option<f32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    origin: Option<[f64; 3]>,
     frames: Vec<OutFrame<'a>>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     points: Vec<[f32; 3]>,
@@ -138,17 +149,6 @@ struct OutFrame<'a> {
     cx: f32,
     cy: f32,
     c2w: [[f32; 4]; 4],
-}
-
-/// Makes an error of a JSON error, with its line and column; serde's message has the
-/// expected and the found value.
-pub(super) fn json_error(path: &Path, expected: &str, error: &serde_json::Error) -> Error {
-    let text = error.to_string();
-    // serde_json appends the place, which `at` holds.
-    let got = text.split(" at line ").next().unwrap_or(&text).to_owned();
-    let place = format!(":{}:{}", error.line(), error.column());
-    let at = if error.line() > 0 { place } else { String::new() };
-    Error::format(path, expected, got).at(at)
 }
 
 /// Converts a JSON number to the side of a picture.
@@ -181,8 +181,8 @@ fn has_this_layout(path: &Path) -> Result<bool> {
     if ["cameras.json", "transforms.json"].contains(&&*name) || !name.ends_with(".json") {
         return Ok(name == "cameras.json");
     }
-    let value: serde_json::Value = serde_json::from_slice(&read(path)?)
-        .map_err(|e| json_error(path, "a JSON file with cameras", &e))?;
+    let value =
+        json::value(&read(path)?).map_err(|e| json::error(path, "a JSON file with cameras", &e))?;
     Ok(value.is_array() || value["frames"][0].get("c2w").is_some())
 }
 
@@ -190,13 +190,15 @@ fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
     let bytes = read(path)?;
     let list = bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[');
     if list {
-        let frames: Vec<SplatFrame> = serde_json::from_slice(&bytes)
-            .map_err(|e| json_error(path, "a list of 3DGS cameras (img_name, rotation, …)", &e))?;
-        let drafts = frames.into_iter().enumerate().map(|(i, f)| splat_draft(path, i, f));
-        return Ok((drafts.collect::<Result<_>>()?, FileInfo::default()));
+        let frames: Vec<SplatFrame> =
+            json::parse(path, &bytes, "a list of 3DGS cameras (img_name, rotation, …)")?;
+        let drafts = frames.into_iter().enumerate().map(|(i, f)| {
+            let name = f.img_name.clone();
+            splat_draft(path, i, f).unwrap_or_else(|e| Draft::refused(name, e))
+        });
+        return Ok((drafts.collect(), FileInfo::default()));
     }
-    let file: InFile = serde_json::from_slice(&bytes)
-        .map_err(|e| json_error(path, "cameras.json (frames with file, fx, …, c2w)", &e))?;
+    let file: InFile = json::parse(path, &bytes, "cameras.json (frames with file, fx, …, c2w)")?;
     let re10k = |f: &InFrame| f.timestamp_us.is_some() || f.re10k_frame.is_some();
     let units = match file.units.as_deref() {
         Some("metres" | "meters" | "m") => Units::Metres,
@@ -215,12 +217,16 @@ fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
             return Err(Error::format(path, "both near and far, 0 < near < far", got));
         }
     };
-    let points = file.points.map(|p| p.into_iter().map(Vec3::from).collect::<Vec<_>>());
+    let points = file.points.map(|p| p.into_iter().map(DVec3::from).collect::<Vec<_>>());
     if let Some(bad) = points.iter().flatten().find(|p| !p.is_finite()) {
         return Err(Error::format(path, "finite points", format!("{bad}")));
     }
-    let drafts = file.frames.into_iter().enumerate().map(|(i, f)| draft(path, i, f));
-    Ok((drafts.collect::<Result<_>>()?, FileInfo { units, near_far, points }))
+    let drafts = file.frames.into_iter().enumerate().map(|(i, f)| {
+        let name = f.file.clone();
+        draft(path, i, f).unwrap_or_else(|e| Draft::refused(name, e))
+    });
+    let origin = file.origin.map_or(DVec3::ZERO, DVec3::from);
+    Ok((drafts.collect(), FileInfo { units, near_far, points, origin }))
 }
 
 fn size(path: &Path, place: &str, width: f64, height: f64) -> Result<Option<(usize, usize)>> {
@@ -268,15 +274,17 @@ fn folder(path: &Path) -> &Path {
 }
 
 /// Reads a scene. Frames without a picture are left out with a warning.
-pub(super) fn load(path: &Path) -> Result<Scene> {
+pub(super) fn load(path: &Path, pictures: Pictures) -> Result<Scene> {
     let (mut drafts, info) = drafts(path)?;
     for d in &mut drafts {
         d.image = find_image(&[folder(path)], &d.file);
     }
-    let mut scene = assemble(path, SceneFormat::CamerasJson, drafts)?;
+    let mut scene = assemble(path, SceneFormat::CamerasJson, pictures, drafts)?;
     scene.units = info.units;
     scene.near_far = info.near_far;
-    scene.points = info.points;
+    scene.points =
+        info.points.map(|points| points.iter().map(|p| (*p - scene.origin).as_vec3()).collect());
+    scene.origin += info.origin;
     Ok(scene)
 }
 
@@ -290,8 +298,13 @@ pub fn load_cameras_json(path: impl AsRef<Path>) -> Result<CameraFile> {
 
 fn read_cameras(path: &Path) -> Result<CameraFile> {
     let (drafts, info) = drafts(path)?;
+    let moved = origin_of(&drafts);
     let mut cameras = Vec::with_capacity(drafts.len());
-    for d in drafts {
+    for mut d in drafts {
+        d.world_from_camera.w_axis -= moved.extend(0.0);
+        if let Some(error) = d.refused {
+            return Err(error);
+        }
         let (Some((width, height)), Lens::Pixels(k)) = (d.size, d.lens) else { continue };
         let [fx, fy, cx, cy] = k.map(|v| v as f32);
         let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
@@ -306,7 +319,8 @@ fn read_cameras(path: &Path) -> Result<CameraFile> {
         let (file, pixels, timestamp) = (d.file, d.pixels, d.timestamp);
         cameras.push(NamedCamera { file, pixels, camera, timestamp, depth });
     }
-    Ok(CameraFile { cameras, units: info.units, near_far: info.near_far })
+    let FileInfo { units, near_far, origin, .. } = info;
+    Ok(CameraFile { cameras, units, near_far, origin: origin + moved })
 }
 
 /// Writes this layout. Floats have enough digits to read back exactly.
@@ -352,7 +366,8 @@ fn write_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) 
     let (near, far) = content.near_far.map(|range| (range.near, range.far)).unzip();
     let frames = frames.collect();
     let points = points.iter().map(Vec3::to_array).collect();
-    let out = OutFile { convention: CONVENTION, units, near, far, frames, points };
+    let origin = Some(content.origin.to_array()).filter(|origin| *origin != [0.0; 3]);
+    let out = OutFile { convention: CONVENTION, units, near, far, origin, frames, points };
     let text = serde_json::to_string_pretty(&out)
         .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
     write_atomic(path, |f| writeln!(f, "{text}"))

@@ -4,7 +4,7 @@
 //!
 //! White space, commas and brackets separate numbers; `#` begins a comment.
 
-use super::assemble::{Draft, Lens, assemble, list_images};
+use super::assemble::{Draft, Lens, Pictures, assemble, list_images};
 use super::scene::{Scene, SceneFormat};
 use super::transforms::opengl_to_opencv;
 use crate::files::{Error, Result, read};
@@ -117,5 +117,5 @@ fn load_folder(folder: &Path, convention: PoseConvention) -> Result<Scene> {
         let file = image.file_name().unwrap_or_default().to_string_lossy().into_owned();
         Draft { image: Some(image), ..Draft::new(place, file, Lens::Pixels(k), pose) }
     });
-    assemble(&poses_path, SceneFormat::Matrices, drafts.collect())
+    assemble(&poses_path, SceneFormat::Matrices, Pictures::Needed, drafts.collect())
 }

@@ -3,6 +3,8 @@
 pub(super) mod assemble;
 pub mod cameras_json;
 pub mod colmap;
+pub mod find;
+mod json;
 pub mod matrices;
 pub mod protocol;
 pub mod re10k;

@@ -6,7 +6,7 @@
 //! * index: `{"scene": {"context": [i, j], "target": [a, b, c]} | null, …}`; a scene of
 //!   null has no pair and is skipped.
 
-use super::cameras_json::json_error;
+use super::json::error as json_error;
 use crate::files::{Error, Result, read};
 use serde::Deserialize;
 use std::collections::BTreeMap;

@@ -14,7 +14,7 @@
 //! 3. by order, if there are as many as lines (numbers in names in numeric order);
 //! 4. by time stamp, if some names are time stamps.
 
-use super::assemble::{Draft, Lens, assemble, list_images};
+use super::assemble::{Draft, Lens, Pictures, assemble, list_images};
 use super::scene::{Scene, SceneFormat, Units};
 use crate::files::{Error, Result, read};
 use glam::{DMat4, DVec4};
@@ -141,7 +141,7 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
         let draft = Draft::new(place, file, Lens::Normalised(c.normalised), c.world_from_camera);
         Some(Draft { image: Some(image), timestamp: Some(c.timestamp), ..draft })
     });
-    let mut scene = assemble(path, SceneFormat::RealEstate10k, drafts.collect())?;
+    let mut scene = assemble(path, SceneFormat::RealEstate10k, Pictures::Needed, drafts.collect())?;
     scene.units = Units::RealEstate10k;
     warnings.append(&mut scene.warnings);
     scene.warnings = warnings;

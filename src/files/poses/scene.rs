@@ -9,14 +9,18 @@
 //! and a picture with one gives a warning. Cameras of photographs without a pose file refer to
 //! the upright pixels ([`Pixels::Upright`]).
 
-use super::assemble::{Draft, Lens, assemble};
+use super::assemble::{self, Draft, Lens, Pictures, assemble};
+use super::find::{Found, PoseFile, find, find_in, not_read};
 use super::{cameras_json, colmap, matrices, re10k, transforms};
-use crate::files::photos::image::{LoadOptions, LoadedPicture, load_with};
-use crate::files::photos::photograph::load_photograph;
-use crate::files::photos::undistort::{Distortion, pinhole, undistort};
+use crate::files::photos::image::{LoadOptions, LoadedPicture, load_with, probe};
+use crate::files::photos::masks;
+use crate::files::photos::photograph::{Photograph, load_photograph};
+use crate::files::photos::undistort::{Distortion, pinhole, undistort, undistort_masked};
 use crate::files::{Error, Result};
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
-use glam::Vec3;
+use glam::{DVec3, Vec3};
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use subsplat_kernels::camera::{Camera, NearFar};
 
@@ -101,6 +105,9 @@ pub struct Frame {
     pub timestamp: Option<i64>,
     /// 16-bit depth map of the picture, if the pose file names one.
     pub depth: Option<PathBuf>,
+    /// Mask of the picture: a grey picture, 0 is masked. The pose file names it, or it lies in a folder `masks`
+    /// ([`Photograph::mask`]). The picture's alpha is a mask as well.
+    pub mask: Option<PathBuf>,
     /// Indices into [`Scene::points`] of the points that this frame observes.
     pub visible: Vec<u32>,
 }
@@ -110,6 +117,8 @@ pub struct Frame {
 pub struct LoadedFrame {
     /// The picture without lens distortion.
     pub picture: Rgb,
+    /// Pixels of the picture that count; `None` where all do.
+    pub mask: Option<Mask>,
     /// Pinhole camera of the picture.
     pub camera: Camera,
     /// Warnings about the file, one line each, with its path.
@@ -143,19 +152,25 @@ impl Frame {
     /// Loads the frame as [`Frame::load`] does, with options, and returns the warnings.
     ///
     /// # Errors
-    /// Errors of [`crate::files::photos::image::load_with`]; a size that is not the camera's.
+    /// Errors of [`crate::files::photos::image::load_with`]; a size that is not the camera's; a mask that cannot
+    /// be read, or that masks all pixels.
     pub fn load_with(&self, options: &LoadOptions) -> Result<LoadedFrame> {
         if let Some(got) = &self.other_shape {
             let k = &self.camera.intrinsics();
             let expected = format!("a picture of {}x{}, or of the same shape", k.width, k.height);
             return Err(Error::format(&self.image, expected, got));
         }
-        let LoadedPicture { picture, warnings } = match self.pixels {
-            Pixels::Stored => load_with(&self.image, options)?,
+        let LoadedPicture { picture, mask, warnings } = match self.pixels {
+            Pixels::Stored => {
+                let loaded = load_with(&self.image, options)?;
+                let file = |file| masks::load(file, &probe(&self.image)?);
+                let mask = masks::both(loaded.mask, self.mask.as_deref().map(file).transpose()?);
+                LoadedPicture { mask: masks::checked(mask, &self.image)?, ..loaded }
+            }
             Pixels::Upright => {
-                let photograph = load_photograph(&self.image, options)?;
-                let (picture, warnings) = (photograph.image, photograph.warnings);
-                LoadedPicture { picture, warnings }
+                let Photograph { image: picture, mask, warnings, .. } =
+                    load_photograph(&self.image, options)?;
+                LoadedPicture { picture, mask, warnings }
             }
         };
         let k = &self.camera.intrinsics();
@@ -164,11 +179,16 @@ impl Frame {
             return Err(Error::format(&self.image, format!("{}x{}", k.width, k.height), got));
         }
         let camera = self.pinhole()?;
-        let picture = match self.distortion {
-            Distortion::None => picture,
-            _ => undistort(&picture, k, &self.distortion, &camera.intrinsics()),
+        let (picture, mask) = match (self.distortion, mask) {
+            (Distortion::None, mask) => (picture, mask),
+            (lens, None) => (undistort(&picture, k, &lens, &camera.intrinsics()), None),
+            (lens, Some(mask)) => {
+                let (picture, mask) =
+                    undistort_masked(&picture, &mask, k, &lens, &camera.intrinsics());
+                (picture, masks::checked(mask, &self.image)?)
+            }
         };
-        Ok(LoadedFrame { picture, camera, warnings })
+        Ok(LoadedFrame { picture, mask, camera, warnings })
     }
 }
 
@@ -187,6 +207,9 @@ pub struct Scene {
     pub units: Units,
     /// Nearest and farthest depth of the pose file, camera z in world units.
     pub near_far: Option<NearFar>,
+    /// Point of the file's world that is the origin of this scene: zero, or the middle of cameras that lie so
+    /// far from their origin that f32 coordinates would be inexact.
+    pub origin: DVec3,
     /// Warnings for the user, one line each.
     pub warnings: Vec<String>,
 }
@@ -223,12 +246,40 @@ impl Scene {
         path: impl AsRef<Path>,
         photographs: &[(PathBuf, Camera)],
     ) -> Result<Self> {
-        assemble(path.as_ref(), source, photographs.iter().map(upright_draft).collect())
+        let names = distinct_names(photographs.iter().map(|(path, _)| path.as_path()));
+        let drafts = photographs.iter().zip(names).map(|(photo, name)| upright_draft(photo, &name));
+        assemble(path.as_ref(), source, Pictures::Needed, drafts.collect())
     }
 }
 
+/// Names of photographs: those of the files where all differ, else the paths below the folder that all have in
+/// common.
+pub fn distinct_names<'a>(paths: impl Iterator<Item = &'a Path> + Clone) -> Vec<PathBuf> {
+    let files: Vec<PathBuf> =
+        paths.clone().filter_map(|p| p.file_name().map(PathBuf::from)).collect();
+    let distinct: HashSet<&PathBuf> = files.iter().collect();
+    let count = paths.clone().count();
+    if distinct.len() == count {
+        return files;
+    }
+    let mut common: Option<PathBuf> = None;
+    for path in paths.clone() {
+        let parent = path.parent().unwrap_or(Path::new(""));
+        let shared = common.as_deref().unwrap_or(parent).components().zip(parent.components());
+        common = Some(shared.take_while(|(a, b)| a == b).map(|(a, _)| a).collect());
+    }
+    let common = common.unwrap_or_default();
+    paths.map(|path| path.strip_prefix(&common).unwrap_or(path).to_owned()).collect()
+}
+
+/// Name of a frame: the path of its picture in a pose file, without `images/` and without the extension of a
+/// picture. A name without such an extension may have dots.
+pub fn frame_name(file: &str) -> String {
+    assemble::frame_name(file)
+}
+
 /// Returns a frame of a photograph and the camera of its upright pixels.
-fn upright_draft((path, camera): &(PathBuf, Camera)) -> Draft {
+fn upright_draft((path, camera): &(PathBuf, Camera), name: &Path) -> Draft {
     let k = camera.intrinsics();
     Draft {
         size: Some((k.width, k.height)),
@@ -236,15 +287,12 @@ fn upright_draft((path, camera): &(PathBuf, Camera)) -> Draft {
         image: Some(path.clone()),
         ..Draft::new(
             String::new(),
-            path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            name.to_string_lossy().into_owned(),
             Lens::Pixels([k.fx, k.fy, k.cx, k.cy].map(f64::from)),
             camera.world_from_camera().as_dmat4(),
         )
     }
 }
-
-/// Folders of a scene in which COLMAP's model may lie.
-const MODEL_FOLDERS: [&str; 4] = ["sparse/0", "sparse", "colmap/sparse/0", ""];
 
 /// Reads the scene of a folder or of a pose file.
 ///
@@ -252,57 +300,63 @@ const MODEL_FOLDERS: [&str; 4] = ["sparse/0", "sparse", "colmap/sparse/0", ""];
 /// No pose file; a malformed pose file (the error names file and line or byte); no picture;
 /// a picture whose size does not match its camera.
 pub fn load_scene(path: impl AsRef<Path>) -> Result<Scene> {
-    load_at(path.as_ref())
+    load_at(path.as_ref(), Pictures::Needed)
 }
 
-fn load_at(path: &Path) -> Result<Scene> {
+/// Reads the cameras of a folder or of a pose file as [`load_scene`] does. Their pictures need not exist:
+/// [`Frame::image`] is empty where there is none.
+///
+/// # Errors
+/// No pose file; a malformed pose file; no camera with the size of its picture.
+pub fn load_cameras(path: impl AsRef<Path>) -> Result<Scene> {
+    load_at(path.as_ref(), Pictures::Unread)
+}
+
+fn load_at(path: &Path, pictures: Pictures) -> Result<Scene> {
     let metadata = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
     if metadata.is_file() {
-        return load_file(path);
+        return load_file(path, pictures);
     }
-    for name in ["cameras.json", "transforms.json"] {
-        let file = path.join(name);
-        if file.is_file() {
-            return load_file(&file);
-        }
-    }
-    for folder in MODEL_FOLDERS {
-        let model = path.join(folder);
-        if colmap::is_model(&model) {
-            return colmap::load(&model);
-        }
-    }
-    if let Some(file) = re10k::find(path)? {
-        return re10k::load(&file);
-    }
-    if path.join("poses.txt").is_file() {
-        return matrices::load(path, matrices::PoseConvention::default());
-    }
-    Err(Error::format(
-        path,
-        "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, or \
-         poses.txt with K.txt",
-        "a folder with none of them",
-    ))
+    let Some(Found { file, notes }) = find(path)? else {
+        let got = not_read(path).unwrap_or_else(|| "a folder with none of them".to_owned());
+        return Err(Error::format(
+            path,
+            "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, or \
+             poses.txt with K.txt",
+            got,
+        ));
+    };
+    let mut scene = match &file {
+        PoseFile::Json(file) => load_file(file, pictures),
+        PoseFile::Colmap(folder) => colmap::load(folder, pictures),
+        PoseFile::Re10k(file) => re10k::load(file),
+        PoseFile::Matrices(folder) => matrices::load(folder, matrices::PoseConvention::default()),
+    }?;
+    scene.warnings.extend(notes);
+    Ok(scene)
 }
 
 /// Reports whether `path` is a folder with a pose file that [`load_scene`] reads.
 pub fn is_scene(path: impl AsRef<Path>) -> bool {
-    let path = path.as_ref();
-    let file = |name: &str| path.join(name).is_file();
-    ["cameras.json", "transforms.json", "poses.txt"].into_iter().any(file)
-        || MODEL_FOLDERS.iter().any(|f| colmap::is_model(&path.join(f)))
-        || re10k::find(path).is_ok_and(|f| f.is_some())
+    find_in(path.as_ref()).is_ok_and(|found| found.is_some())
 }
 
-fn load_file(path: &Path) -> Result<Scene> {
+/// Reports whether [`load_scene`] finds a pose file in the folder `path` or, where it has no photographs, in a
+/// folder below it.
+pub fn has_scene(path: impl AsRef<Path>) -> bool {
+    find(path.as_ref()).is_ok_and(|found| found.is_some())
+}
+
+fn load_file(path: &Path, pictures: Pictures) -> Result<Scene> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     let folder = path.parent().unwrap_or(Path::new(""));
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match (name.as_str(), extension.as_str()) {
-        (_, "json") if cameras_json::is_cameras_json(path)? => cameras_json::load(path),
-        (_, "json") => transforms::load(path),
-        ("cameras.txt" | "images.txt" | "points3d.txt", _) | (_, "bin") => colmap::load(folder),
+        (_, "json") if cameras_json::is_cameras_json(path)? => cameras_json::load(path, pictures),
+        (_, "json") => transforms::load(path, pictures),
+        ("cameras.txt" | "images.txt" | "points3d.txt", _) | (_, "bin") => {
+            colmap::load(folder, pictures)
+        }
         ("poses.txt" | "k.txt", _) => matrices::load(folder, matrices::PoseConvention::default()),
         (_, "txt") => re10k::load(path),
         _ => Err(Error::format(

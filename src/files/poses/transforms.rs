@@ -5,10 +5,12 @@
 //! (else `fl_x`), `cx`, `cy` (else the middle), `w`, `h` (else the stored picture's). Files
 //! without `fl_x` have `camera_angle_x` and `camera_angle_y` in radians. Camera models: none
 //! given, SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
-//! OPENCV_FISHEYE. Other keys (`aabb_scale`, `sharpness`, `ply_file_path`, …) are ignored.
+//! OPENCV_FISHEYE. `mask_path` of a frame names its mask ([`super::scene::Frame::mask`]). Other keys
+//! (`aabb_scale`, `sharpness`, `ply_file_path`, …) are ignored.
 
-use super::assemble::{Draft, Lens, assemble, find_image};
-use super::cameras_json::{json_error, matrix, side};
+use super::assemble::{Draft, Lens, Pictures, assemble, find_image};
+use super::cameras_json::{matrix, side};
+use super::json;
 use super::scene::{Scene, SceneFormat};
 use crate::files::photos::undistort::Distortion;
 use crate::files::{Error, Result, read};
@@ -99,6 +101,8 @@ struct File {
 #[serde(expecting = "a frame: file_path, transform_matrix")]
 struct FileFrame {
     file_path: String,
+    mask_path: Option<String>,
+    #[serde(deserialize_with = "json::rows")]
     transform_matrix: Vec<Vec<f64>>,
     #[serde(flatten)]
     optics: Optics,
@@ -110,54 +114,63 @@ pub(super) fn opengl_to_opencv(pose: DMat4) -> DMat4 {
 }
 
 /// Reads a scene. Frames without a picture are left out with a warning.
-pub(super) fn load(path: &Path) -> Result<Scene> {
-    let file: File = serde_json::from_slice(&read(path)?).map_err(|e| {
-        json_error(path, "transforms.json (frames with file_path, transform_matrix)", &e)
-    })?;
-    let folder = path.parent().unwrap_or(Path::new(""));
-    let mut drafts = Vec::with_capacity(file.frames.len());
-    for (i, f) in file.frames.into_iter().enumerate() {
+pub(super) fn load(path: &Path, pictures: Pictures) -> Result<Scene> {
+    let expected = "transforms.json (frames with file_path, transform_matrix)";
+    let file: File = json::parse(path, &read(path)?, expected)?;
+    let drafts = file.frames.into_iter().enumerate().map(|(i, frame)| {
+        let name = frame.file_path.clone();
         let place = format!(" frame {i}");
-        let bad = |expected: &str, got: String| Error::format(path, expected, got).at(&place);
-        let pose = matrix(&f.transform_matrix)
-            .map_err(|got| bad("transform_matrix of 4x4 numbers", got))?;
-        let optics = f.optics.over(&file.optics);
-        let distortion = optics.distortion().map_err(|got| {
-            bad(
-                "camera_model SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV \
-                 or OPENCV_FISHEYE",
-                got,
-            )
-        })?;
-        let size = match (optics.w, optics.h) {
-            (Some(w), Some(h)) => match (side(w), side(h)) {
-                (Some(w), Some(h)) => Some((w, h)),
-                _ => return Err(bad("w and h in whole pixels", format!("{w}x{h}"))),
-            },
-            _ => None,
-        };
-        let image = find_image(&[folder], &f.file_path);
-        // Pixel intrinsics without a size belong to the stored picture.
-        let stored = match (&image, size) {
-            (_, Some(s)) => Some(s),
-            (Some(image), None) => {
-                let probe = crate::files::photos::image::probe(image)?;
-                Some((probe.width, probe.height))
-            }
-            (None, None) => None,
-        };
-        let lens = lens(&optics, stored).map_err(|got| {
-            bad("fl_x, or camera_angle_x between 0 and π (for the file or the frame)", got)
-        })?;
-        let pose = opengl_to_opencv(pose);
-        drafts.push(Draft {
-            image,
-            size: stored,
-            distortion,
-            ..Draft::new(place, f.file_path, lens, pose)
-        });
-    }
-    assemble(path, SceneFormat::Transforms, drafts)
+        draft(path, place, frame, &file.optics).unwrap_or_else(|e| Draft::refused(name, e))
+    });
+    assemble(path, SceneFormat::Transforms, pictures, drafts.collect())
+}
+
+fn draft(path: &Path, place: String, frame: FileFrame, file: &Optics) -> Result<Draft> {
+    let bad = |expected: &str, got: String| Error::format(path, expected, got).at(&place);
+    let pose = matrix(&frame.transform_matrix)
+        .map_err(|got| bad("transform_matrix of 4x4 numbers", got))?;
+    let optics = frame.optics.over(file);
+    let distortion = optics.distortion().map_err(|got| {
+        bad(
+            "camera_model SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV \
+             or OPENCV_FISHEYE",
+            got,
+        )
+    })?;
+    let size = match (optics.w, optics.h) {
+        (Some(w), Some(h)) => match (side(w), side(h)) {
+            (Some(w), Some(h)) => Some((w, h)),
+            _ => return Err(bad("w and h in whole pixels", format!("{w}x{h}"))),
+        },
+        _ => None,
+    };
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let image = find_image(&[folder], &frame.file_path);
+    let mask = frame.mask_path.filter(|mask| !mask.is_empty());
+    // A name alone would be found among the photographs.
+    let found =
+        |mask: &str| find_image(&[folder], mask).filter(|file| Some(file) != image.as_ref());
+    let mask = mask.map(|mask| found(&mask).unwrap_or(folder.join(mask)));
+    // Pixel intrinsics without a size belong to the stored picture.
+    let stored = match (&image, size) {
+        (_, Some(s)) => Some(s),
+        (Some(image), None) => {
+            let probe = crate::files::photos::image::probe(image)?;
+            Some((probe.width, probe.height))
+        }
+        (None, None) => None,
+    };
+    let lens = lens(&optics, stored).map_err(|got| {
+        bad("fl_x, or camera_angle_x between 0 and π (for the file or the frame)", got)
+    })?;
+    let pose = opengl_to_opencv(pose);
+    Ok(Draft {
+        image,
+        size: stored,
+        distortion,
+        mask,
+        ..Draft::new(place, frame.file_path, lens, pose)
+    })
 }
 
 /// Computes pixel intrinsics for a picture of `size`. A frame without a size has no picture

@@ -8,7 +8,7 @@
 //! `sh`: one byte per coefficient over [−4, 4], channel-major as `f_rest_*`.
 
 use super::gaussians::{Decoded, Incoming, dc_from_colour};
-use super::ply::{REST_COUNTS, rest_to_set};
+use super::ply::{REST_COUNTS, note_of_unread, rest_to_set};
 use super::ply_container::{Element, Header, Scalar, Source};
 use crate::files::{Error, Result};
 
@@ -71,7 +71,10 @@ pub(super) fn decode(header: Header, source: &mut Source) -> Result<Decoded> {
     let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
     let splats = incoming.into_splats(path)?;
     let flavour = format!("compressed ply {}", header.encoding.name());
-    Ok(Decoded { splats, flavour, comments: header.comments })
+    let vertex = header.elements.iter().find(|e| e.name == "vertex");
+    let packed = |i: usize, e: &Element| PACKED.contains(&e.properties[i].name.as_str());
+    let notes = vertex.and_then(|e| note_of_unread(e, |i| packed(i, e)));
+    Decoded::new(splats, flavour, header.comments, notes.into_iter().collect(), path)
 }
 
 fn need(element: &Element, name: &str, kinds: &[Scalar], source: &Source) -> Result<usize> {

@@ -4,6 +4,12 @@
 //! Writers fold a child's colour into SH coefficients of its own: γ·h of its parent, δ/C₀
 //! added to the constant one, in the standard basis, truncated to the degree written.
 //! Readers give K = 1, no gain, the standard basis and unit quaternions.
+//!
+//! Readers leave out what no writer means, and say so in a note: a Gaussian with a number that is
+//! NaN or infinite, and one with a quaternion of zeros. The second is a row that was never
+//! written: a trainer that stopped, or a file allocated for more rows than it got. Drawn, such
+//! rows are a fog at the origin (σ = e⁰, opacity ½). splat-transform leaves them out too
+//! (its pull request 288). A file of nothing else is an error.
 
 use super::SaveOptions;
 use crate::files::{Error, Result};
@@ -312,8 +318,8 @@ fn wxyz(q: DQuat) -> [f32; 4] {
     [q.w as f32, q.x as f32, q.y as f32, q.z as f32]
 }
 
-/// Normalises `q`. The zero quaternion becomes the identity, as in the 3DGS kernels; one
-/// that is not finite is left to [`check_finite`].
+/// Normalises `q` for a file. The zero quaternion becomes the identity, as in the 3DGS kernels;
+/// one that is not finite stays as it is.
 pub(super) fn unit(q: [f32; 4]) -> [f32; 4] {
     let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
     if norm == 0.0 {
@@ -332,8 +338,8 @@ pub(super) fn logit(opacity: f32) -> f32 {
 }
 
 /// Computes the opacity after the sigmoid; ±∞ give 1 and 0.
-pub(super) fn sigmoid(logit: f32) -> f32 {
-    (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
+pub(super) fn sigmoid(logit: f32) -> f64 {
+    1.0 / (1.0 + (-f64::from(logit)).exp())
 }
 
 /// Computes the coefficient of the constant function for a display colour in [0, 1].
@@ -359,7 +365,8 @@ impl Incoming {
         }
     }
 
-    /// Appends one Gaussian with a zeroed SH set, and returns the set `[D, 3]`.
+    /// Appends one Gaussian with a zeroed SH set, and returns the set `[D, 3]`. A quaternion of
+    /// zeros stays: [`Decoded::new`] leaves the Gaussian out.
     pub fn push(
         &mut self,
         mean: [f32; 3],
@@ -368,7 +375,7 @@ impl Incoming {
         opacity: f32,
     ) -> &mut [f32] {
         self.rows.extend(mean);
-        self.rows.extend(unit(quat));
+        self.rows.extend(if quat == NO_ROTATION { quat } else { unit(quat) });
         self.rows.extend(scale);
         self.rows.push(opacity);
         let start = self.sh.len();
@@ -397,7 +404,7 @@ impl Incoming {
         (self.sh, self.sh_degree) = (raised, degree);
     }
 
-    /// Makes a set of all Gaussians. Their numbers may be NaN or infinite.
+    /// Makes a set of all Gaussians. Their numbers may be NaN or infinite, their quaternions zero.
     pub fn into_splats(self, path: &Path) -> Result<Splats> {
         let Self { rows, sh, sh_degree } = self;
         let gain = Vec::new();
@@ -407,31 +414,114 @@ impl Incoming {
     }
 }
 
+/// Quaternion that stands for no rotation, not the identity: no orientation at all.
+const NO_ROTATION: [f32; 4] = [0.0; 4];
+
 /// The decoded content of a file.
 pub(super) struct Decoded {
-    /// The Gaussians; numbers may be NaN or infinite.
+    /// The Gaussians: finite numbers, unit quaternions.
     pub splats: Splats,
     /// Flavour: `ply binary_little_endian`, `spz 3`.
     pub flavour: String,
     /// Comments of the file.
     pub comments: Vec<String>,
+    /// What reading applied or did not read, a line each.
+    pub notes: Vec<String>,
+    /// Gaussians that were left out because a number is NaN or infinite.
+    pub non_finite: usize,
+    /// Gaussians that were left out because their quaternion is zero.
+    pub zero_rows: usize,
+}
+
+impl Decoded {
+    /// Leaves out the Gaussians that no writer means, with a note for each of the two reasons after
+    /// `notes`. `splats` are those of a reader: K = 1, no gain.
+    ///
+    /// # Errors
+    /// No Gaussian is left, of one or more.
+    pub fn new(
+        mut splats: Splats,
+        flavour: String,
+        comments: Vec<String>,
+        mut notes: Vec<String>,
+        path: &Path,
+    ) -> Result<Self> {
+        let (all, set) = (splats.len(), 3 * splats.sh_coefficients());
+        let (mut kept, mut zero_rows, mut non_finite) = (0, 0, 0);
+        // The first Gaussian of each reason.
+        let (mut first_zero, mut first_non_finite) = (0, String::new());
+        for i in 0..all {
+            let row = i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE;
+            let sh = i * set..(i + 1) * set;
+            let found = not_finite(&splats.rows[row.clone()]).or_else(|| {
+                let bad = splats.sh[sh.clone()].iter().find(|v| !v.is_finite());
+                bad.map(|v| ("SH coefficient", *v))
+            });
+            if let Some((what, v)) = found {
+                if non_finite == 0 {
+                    first_non_finite = format!("splat {i} ({what} {v})");
+                }
+                non_finite += 1;
+                continue;
+            }
+            if splats.quat_wxyz(i) == NO_ROTATION {
+                if zero_rows == 0 {
+                    first_zero = i;
+                }
+                zero_rows += 1;
+                continue;
+            }
+            if kept < i {
+                splats.rows.copy_within(row, kept * SPLAT_STRIDE);
+                splats.sh.copy_within(sh, kept * set);
+            }
+            kept += 1;
+        }
+        splats.rows.truncate(kept * SPLAT_STRIDE);
+        splats.sh.truncate(kept * set);
+        let mut reasons = Vec::new();
+        if zero_rows > 0 {
+            reasons.push(format!(
+                "{zero_rows} of {all} splats, whose rotation is 0 0 0 0 (rows that were never \
+                 written?); the first is splat {first_zero}"
+            ));
+        }
+        if non_finite > 0 {
+            reasons.push(format!(
+                "{non_finite} of {all} splats, which hold numbers that are NaN or infinite; the \
+                 first is {first_non_finite}"
+            ));
+        }
+        if all > 0 && kept == 0 {
+            let expected = "a splat with finite numbers and a rotation";
+            return Err(Error::format(path, expected, format!("only {}", reasons.join("; and "))));
+        }
+        notes.extend(reasons.into_iter().map(|reason| format!("left out: {reason}")));
+        Ok(Self { splats, flavour, comments, notes, non_finite, zero_rows })
+    }
+}
+
+/// Returns the first number of a packed row that is NaN or infinite, with the name of its field.
+fn not_finite(row: &[f32]) -> Option<(&'static str, f32)> {
+    let offset = row.iter().position(|v| !v.is_finite())?;
+    let what = match offset {
+        0..QUAT_OFFSET => "mean",
+        QUAT_OFFSET..SCALE_OFFSET => "quaternion",
+        SCALE_OFFSET..OPACITY_OFFSET => "scale",
+        _ => "opacity",
+    };
+    Some((what, row[offset]))
 }
 
 /// Refuses the first Gaussian with a number that is not finite.
-pub(super) fn check_finite(splats: &Splats, path: &Path) -> Result<()> {
+fn check_finite(splats: &Splats, path: &Path) -> Result<()> {
     let refuse = |i: usize, what: &str, v: f32| {
         let got = format!("{what} {v}");
         Err(Error::format(path, "finite numbers", got).at(format!(" splat {i}")))
     };
     for (i, row) in splats.rows.chunks_exact(SPLAT_STRIDE).enumerate() {
-        if let Some(offset) = row.iter().position(|v| !v.is_finite()) {
-            let what = match offset {
-                0..QUAT_OFFSET => "mean",
-                QUAT_OFFSET..SCALE_OFFSET => "quaternion",
-                SCALE_OFFSET..OPACITY_OFFSET => "scale",
-                _ => "opacity",
-            };
-            return refuse(i, what, row[offset]);
+        if let Some((what, v)) = not_finite(row) {
+            return refuse(i, what, v);
         }
     }
     if let Some(at) = splats.sh.iter().position(|v| !v.is_finite()) {

@@ -5,9 +5,7 @@
 //! Quantised attributes are read as the extension allows them. Counts, offsets, strides and
 //! chunk lengths are compared with the bytes before anything is allocated.
 
-use super::gaussians::{
-    Decoded, HALF_TURN_X, Incoming, Similarity, check_finite, transform, truncated, u32_at,
-};
+use super::gaussians::{Decoded, HALF_TURN_X, Incoming, Similarity, transform, truncated, u32_at};
 use super::glb::{
     CHUNK_BIN, CHUNK_JSON, EXTENSION, FLOAT, MAGIC, POINTS, SH_DEGREE_MAX, UNSIGNED_SHORT,
 };
@@ -28,13 +26,10 @@ const JSON_MAX: usize = 16 << 20;
 ///
 /// # Errors
 /// Not glTF 2 binary, chunk lengths that do not fill the file, no splats, an accessor beyond
-/// its buffer, a compressed or sparse one, a mirrored or sheared node, numbers that are not
-/// finite.
+/// its buffer, a compressed or sparse one, a mirrored or sheared node, no Gaussian with finite
+/// numbers and a rotation.
 pub fn parse_glb(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
-    let name = name.as_ref();
-    let decoded = decode(bytes, name)?;
-    check_finite(&decoded.splats, name)?;
-    Ok(decoded.splats)
+    Ok(decode(bytes, name.as_ref())?.splats)
 }
 
 #[derive(Deserialize)]
@@ -166,7 +161,7 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
         }
     }
     let splats = join(parts, path)?;
-    Ok(Decoded { splats, flavour: format!("glb {EXTENSION}"), comments })
+    Decoded::new(splats, format!("glb {EXTENSION}"), comments, Vec::new(), path)
 }
 
 /// Returns the JSON chunk and the binary one (empty where there is none).

@@ -7,9 +7,7 @@
 //! by degree, channel-major within each; σ is linear, quaternions wxyz.
 //! Source: the layout of GaussianSplats3D's SplatBuffer and splat-transform's file.
 
-use super::gaussians::{
-    Decoded, Incoming, array, check_finite, dc_from_colour, f32_at, truncated, u32_at,
-};
+use super::gaussians::{Decoded, Incoming, array, dc_from_colour, f32_at, truncated, u32_at};
 use crate::files::{Error, Result};
 use crate::scene::splats::Splats;
 use half::f16;
@@ -26,13 +24,10 @@ const STEPS: u32 = 32767;
 /// Reads a `.ksplat` from memory. `name` is for errors.
 ///
 /// # Errors
-/// Another version or compression level, sections that do not fill the bytes, numbers
-/// that are not finite.
+/// Another version or compression level, sections that do not fill the bytes, no Gaussian with
+/// finite numbers and a rotation.
 pub fn parse_ksplat(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
-    let name = name.as_ref();
-    let decoded = decode(bytes, name)?;
-    check_finite(&decoded.splats, name)?;
-    Ok(decoded.splats)
+    Ok(decode(bytes, name.as_ref())?.splats)
 }
 
 /// The bytes of a file, and the fields of its header that concern every section.
@@ -110,7 +105,7 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     }
     let splats = incoming.into_splats(path)?;
     let flavour = format!("ksplat {}.{} level {level}", bytes[0], bytes[1]);
-    Ok(Decoded { splats, flavour, comments: Vec::new() })
+    Decoded::new(splats, flavour, Vec::new(), Vec::new(), path)
 }
 
 impl File<'_> {

@@ -12,6 +12,8 @@
 //!
 //! "ours": OpenCV axes, y down; viewers of `.ply` and `.splat` rotate the scene themselves.
 //! SH of degree 4 are dropped by default, since viewers read 3.
+//!
+//! What a reader applies, leaves out or does not read, it says in a note ([`SplatFile::notes`]).
 
 pub mod compressed_ply;
 mod gaussians;
@@ -25,7 +27,7 @@ pub mod spz;
 
 use crate::files::{Error, Result, read, write_atomic};
 use crate::scene::splats::Splats;
-use gaussians::{Decoded, HALF_TURN_X, Outgoing, check_finite};
+use gaussians::{Decoded, HALF_TURN_X, Outgoing};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
@@ -152,11 +154,26 @@ pub struct SaveReport {
     pub bytes: u64,
 }
 
+/// Content of a splat file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SplatFile {
+    /// The Gaussians: standard SH basis, K = 1, unit world quaternions, no gain.
+    pub splats: Splats,
+    /// Comments of the file ([`SaveOptions::comments`]).
+    pub comments: Vec<String>,
+    /// Lines for a person, without the file's name: Gaussians that were left out with their number
+    /// and the reason, properties that were applied (`filter_3D`) or not read.
+    pub notes: Vec<String>,
+}
+
 /// Reads a splat file. A magic number decides the format, else the file's extension. The
 /// result has the standard SH basis, K = 1, unit world quaternions and no gain.
 ///
+/// Gaussians with a number that is NaN or infinite, or with a quaternion of zeros, are left out;
+/// [`load_splat_file`] says how many.
+///
 /// # Errors
-/// An unknown format; the errors of the format's reader.
+/// An unknown format; the errors of the format's reader; no Gaussian left, of one or more.
 pub fn load_splats(path: impl AsRef<Path>) -> Result<Splats> {
     Ok(load_with_comments(path)?.0)
 }
@@ -166,10 +183,17 @@ pub fn load_splats(path: impl AsRef<Path>) -> Result<Splats> {
 /// # Errors
 /// As [`load_splats`].
 pub fn load_with_comments(path: impl AsRef<Path>) -> Result<(Splats, Vec<String>)> {
-    let path = path.as_ref();
-    let decoded = decode(path)?.1;
-    check_finite(&decoded.splats, path)?;
-    Ok((decoded.splats, decoded.comments))
+    let SplatFile { splats, comments, .. } = load_splat_file(path)?;
+    Ok((splats, comments))
+}
+
+/// Reads a splat file, its comments and the notes on what was left out, applied or not read.
+///
+/// # Errors
+/// As [`load_splats`].
+pub fn load_splat_file(path: impl AsRef<Path>) -> Result<SplatFile> {
+    let Decoded { splats, comments, notes, .. } = decode(path.as_ref())?.1;
+    Ok(SplatFile { splats, comments, notes })
 }
 
 fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
@@ -224,7 +248,6 @@ fn decode_bytes(format: SplatFormat, bytes: &[u8], path: &Path) -> Result<Decode
 pub fn parse_splats(bytes: &[u8], name: impl AsRef<Path>) -> Result<(Splats, Vec<String>)> {
     let name = name.as_ref();
     let decoded = decode_bytes(format_of(bytes, name)?, bytes, name)?;
-    check_finite(&decoded.splats, name)?;
     Ok((decoded.splats, decoded.comments))
 }
 
@@ -389,15 +412,17 @@ pub struct SplatInfo {
     pub flavour: String,
     /// Size of the file.
     pub bytes: u64,
-    /// Number of Gaussians.
+    /// Number of Gaussians that are read, without the two kinds below.
     pub count: usize,
     /// SH degree.
     pub sh_degree: usize,
-    /// Gaussians with a number that is NaN or infinite; the fields below leave them out.
+    /// Gaussians that are left out because a number is NaN or infinite.
     pub non_finite: usize,
+    /// Gaussians that are left out because their quaternion is zero: rows that were never written.
+    pub zero_rows: usize,
     /// Gaussians that no pixel shows (opacity below 1/255).
     pub invisible: usize,
-    /// Smallest and largest mean, world axes; `None` without a finite Gaussian.
+    /// Smallest and largest mean, world axes; `None` without a Gaussian.
     pub bounds: Option<[[f32; 3]; 2]>,
     /// [`SplatInfo::QUANTILES`] of the opacity.
     pub opacity: Vec<f32>,
@@ -405,6 +430,8 @@ pub struct SplatInfo {
     pub scale: Vec<f32>,
     /// Comments of the file.
     pub comments: Vec<String>,
+    /// As [`SplatFile::notes`].
+    pub notes: Vec<String>,
 }
 
 impl SplatInfo {
@@ -413,14 +440,9 @@ impl SplatInfo {
 
     fn of(format: SplatFormat, decoded: Decoded, bytes: u64) -> Self {
         let s = &decoded.splats;
-        let set = 3 * s.sh_coefficients();
-        let finite = |i: usize| {
-            let sh = &s.sh[i * set..(i + 1) * set];
-            s.row(i).iter().chain(sh).all(|v| v.is_finite())
-        };
         let mut bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
         let (mut opacity, mut scale) = (Vec::new(), Vec::new());
-        for i in (0..s.len()).filter(|&i| finite(i)) {
+        for i in 0..s.len() {
             for (axis, m) in s.mean(i).into_iter().enumerate() {
                 bounds[0][axis] = bounds[0][axis].min(m);
                 bounds[1][axis] = bounds[1][axis].max(m);
@@ -434,12 +456,14 @@ impl SplatInfo {
             bytes,
             count: s.len(),
             sh_degree: s.sh_degree,
-            non_finite: s.len() - opacity.len(),
+            non_finite: decoded.non_finite,
+            zero_rows: decoded.zero_rows,
             invisible: opacity.iter().filter(|o| **o < ALPHA_MIN).count(),
             bounds: (!opacity.is_empty()).then_some(bounds),
             opacity: quantiles(opacity),
             scale: quantiles(scale),
             comments: decoded.comments,
+            notes: decoded.notes,
         }
     }
 }
@@ -451,10 +475,10 @@ fn quantiles(mut values: Vec<f32>) -> Vec<f32> {
     SplatInfo::QUANTILES.iter().filter_map(|q| values.get(rank(*q)).copied()).collect()
 }
 
-/// Reads a splat file and describes it. Numbers that are not finite are counted.
+/// Reads a splat file and describes it.
 ///
 /// # Errors
-/// As [`load_splats`], except for numbers that are not finite.
+/// As [`load_splats`].
 pub fn splat_info(path: impl AsRef<Path>) -> Result<SplatInfo> {
     let (format, decoded, bytes) = decode(path.as_ref())?;
     Ok(SplatInfo::of(format, decoded, bytes))

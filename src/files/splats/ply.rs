@@ -9,11 +9,12 @@
 //! (`gaussians.rs`).
 //!
 //! The reader accepts ascii and both byte orders, any property order and number type, 0, 9,
-//! 24, 45 or 72 `f_rest`, and `red green blue` in place of `f_dc` (nerfstudio). It skips
-//! other properties and elements, and refuses bytes after the last element.
+//! 24, 45 or 72 `f_rest`, and `red green blue` in place of `f_dc` (nerfstudio). It applies
+//! `filter_3D` (Mip-Splatting), names the vertex properties that it does not read in a note,
+//! skips other elements, and refuses bytes after the last element.
 //! `compressed_ply.rs` reads PlayCanvas' packed files.
 
-use super::gaussians::{Decoded, Incoming, Outgoing, check_finite, dc_from_colour, logit, sigmoid};
+use super::gaussians::{Decoded, Incoming, Outgoing, dc_from_colour, logit, sigmoid};
 use super::ply_container::{Element, Header, Scalar, Source};
 use super::{SaveOptions, Up, compressed_ply};
 use crate::files::{Error, Result};
@@ -25,19 +26,24 @@ use std::path::Path;
 pub(super) const REST_COUNTS: [usize; 5] = [0, 9, 24, 45, 72];
 /// Gaussians per write: about 250 KiB at degree 3.
 const BLOCK: usize = 1024;
+/// Property of Mip-Splatting: standard deviation of the filter of each Gaussian, world units.
+const FILTER: &str = "filter_3D";
+/// Properties without a note: normals, which files of 3DGS leave zero, and colours for viewers
+/// of points, beside `f_dc` and `opacity`.
+const REDUNDANT: [&str; 7] = ["nx", "ny", "nz", "red", "green", "blue", "alpha"];
+/// Most names in a note, and the characters of a name.
+const NAMES_MAX: usize = 12;
+const NAME_CHARS_MAX: usize = 40;
 
 /// Reads a `.ply` from memory: the plain layout of 3DGS or PlayCanvas' packed one.
 /// `name` is for errors.
 ///
 /// # Errors
 /// Not a PLY, not a splat file, a truncated file, a count that the bytes do not bear out,
-/// bytes after the last element, numbers that are not finite.
+/// bytes after the last element, no Gaussian with finite numbers and a rotation.
 pub fn parse_ply(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
-    let name = name.as_ref();
     let mut reader = bytes;
-    let decoded = decode(&mut reader, bytes.len() as u64, name)?;
-    check_finite(&decoded.splats, name)?;
-    Ok(decoded.splats)
+    Ok(decode(&mut reader, bytes.len() as u64, name.as_ref())?.splats)
 }
 
 /// Reads a file of `length` bytes from `reader`.
@@ -47,10 +53,12 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
     if compressed_ply::is_compressed(&header) {
         return compressed_ply::decode(header, &mut source);
     }
-    let mut incoming = None;
+    let (mut incoming, mut notes) = (None, Vec::new());
     for element in &header.elements {
         if element.name == "vertex" && incoming.is_none() {
-            incoming = Some(read_vertices(&header, element, &mut source)?);
+            let layout = Layout::of(element, path)?;
+            incoming = Some(read_vertices(&header, element, &layout, &mut source)?);
+            notes = layout.notes(element);
         } else {
             header.rows(element, &mut source, |_, _| Ok(()))?;
         }
@@ -59,7 +67,37 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
     let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
     let splats = incoming.into_splats(path)?;
     let flavour = format!("ply {}", header.encoding.name());
-    Ok(Decoded { splats, flavour, comments: header.comments })
+    Decoded::new(splats, flavour, header.comments, notes, path)
+}
+
+/// Names the properties of `element` that are neither read nor redundant, for a note.
+pub(super) fn note_of_unread(element: &Element, is_read: impl Fn(usize) -> bool) -> Option<String> {
+    let all = element.properties.iter().enumerate();
+    let mut names = all.filter_map(|(i, p)| {
+        let unread = !is_read(i) && !REDUNDANT.contains(&p.name.as_str());
+        unread.then(|| p.name.chars().take(NAME_CHARS_MAX).flat_map(char::escape_debug))
+    });
+    let shown: Vec<String> = names.by_ref().take(NAMES_MAX).map(String::from_iter).collect();
+    let more = match names.count() {
+        0 => String::new(),
+        n => format!(" and {n} more"),
+    };
+    (!shown.is_empty())
+        .then(|| format!("vertex properties that are not read: {}{more}", shown.join(", ")))
+}
+
+/// Applies Mip-Splatting's filter of standard deviation `filter`, world units: σ' = √(σ² + f²) on
+/// each axis. Returns σ' and the factor Πσ / Πσ' of the opacity, which keeps the Gaussian's
+/// integral. Source: Yu et al., "Mip-Splatting", 2024, section 5.1, and the authors' program,
+/// which stores σ and the opacity without the filter and applies it when it renders.
+fn filtered(scale: [f64; 3], filter: f64) -> ([f64; 3], f64) {
+    // The same bits as without the property; also no 0/0 where σ is zero.
+    if filter == 0.0 {
+        return (scale, 1.0);
+    }
+    let wide = scale.map(|s| (s * s + filter * filter).sqrt());
+    let factor = scale.iter().zip(wide).map(|(s, w)| s / w).product();
+    (wide, factor)
 }
 
 /// Indices of the properties of a row.
@@ -72,6 +110,8 @@ struct Layout {
     /// Divisor to [0, 1] where `red green blue` stand in place of `f_dc`.
     colour_range: Option<f64>,
     rest: Vec<usize>,
+    /// [`FILTER`].
+    filter: Option<usize>,
 }
 
 impl Layout {
@@ -112,12 +152,32 @@ impl Layout {
             let got = format!("{named}, of which {} in sequence", rest.len());
             return Err(Error::format(path, "0, 9, 24, 45 or 72 properties f_rest_0, …", got));
         }
-        Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest })
+        let filter = element.position(FILTER);
+        Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest, filter })
+    }
+
+    fn reads(&self, i: usize) -> bool {
+        let Self { mean, scale, quat, opacity, dc, rest, filter, .. } = self;
+        [&mean[..], scale, quat, dc, rest].iter().any(|all| all.contains(&i))
+            || *opacity == i
+            || *filter == Some(i)
+    }
+
+    /// Notes on what is applied and what is not read.
+    fn notes(&self, element: &Element) -> Vec<String> {
+        let filter = self.filter.map(|_| {
+            format!("the property {FILTER} (Mip-Splatting) is applied to sizes and opacities")
+        });
+        filter.into_iter().chain(note_of_unread(element, |i| self.reads(i))).collect()
     }
 }
 
-fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Result<Incoming> {
-    let layout = Layout::of(element, source.path)?;
+fn read_vertices(
+    header: &Header,
+    element: &Element,
+    layout: &Layout,
+    source: &mut Source,
+) -> Result<Incoming> {
     let mut incoming = Incoming::with_capacity(header.checked_count(element, source)?, 0);
     let mut rest = vec![0.0f32; layout.rest.len()];
     header.rows(element, source, |_, v| {
@@ -126,11 +186,13 @@ fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Res
         }
         // Degrees that are zero in every row take no memory and no time.
         incoming.raise_degree(used_degree(&rest));
+        let (scale, factor) =
+            filtered(layout.scale.map(|i| v[i].exp()), layout.filter.map_or(0.0, |i| v[i]));
         let sh = incoming.push(
             layout.mean.map(|i| v[i] as f32),
             layout.quat.map(|i| v[i] as f32),
-            layout.scale.map(|i| v[i].exp() as f32),
-            sigmoid(v[layout.opacity] as f32),
+            scale.map(|s| s as f32),
+            (sigmoid(v[layout.opacity] as f32) * factor) as f32,
         );
         for (h, i) in sh.iter_mut().zip(layout.dc) {
             *h = match layout.colour_range {

@@ -6,7 +6,7 @@
 //! opacity, largest first, so that a viewer can show a prefix while it loads. A file cut at
 //! the end of a record is indistinguishable from a shorter one.
 
-use super::gaussians::{Decoded, Incoming, Outgoing, array, check_finite, dc_from_colour, f32_at};
+use super::gaussians::{Decoded, Incoming, Outgoing, array, dc_from_colour, f32_at};
 use crate::files::{Error, Result};
 use crate::scene::splats::Splats;
 use std::io::Write;
@@ -21,13 +21,10 @@ const BLOCK: usize = 4096;
 /// Reads a `.splat` from memory. `name` is for errors.
 ///
 /// # Errors
-/// Not a positive multiple of 32 bytes; a mean or scale that is not finite; a negative
-/// scale, which gives most files of another format away.
+/// Not a positive multiple of 32 bytes; a negative scale, which gives most files of another
+/// format away; no Gaussian with finite numbers and a rotation.
 pub fn parse_splat(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
-    let name = name.as_ref();
-    let decoded = decode(bytes, name)?;
-    check_finite(&decoded.splats, name)?;
-    Ok(decoded.splats)
+    Ok(decode(bytes, name.as_ref())?.splats)
 }
 
 pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
@@ -47,14 +44,20 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
             return Err(Error::format(path, "scales of 0 or more", got).at(format!(" splat {i}")));
         }
         let [red, green, blue, alpha] = array::<4>(record, 24, path)?;
-        let quat = array::<4>(record, 28, path)?.map(|b| (f32::from(b) - 128.0) / 128.0);
+        // Bytes of zero alone are a record that was never written; as a rotation they are
+        // (−1, −1, −1, −1).
+        let quat = if record.iter().all(|b| *b == 0) {
+            [0.0; 4]
+        } else {
+            array::<4>(record, 28, path)?.map(|b| (f32::from(b) - 128.0) / 128.0)
+        };
         let sh = incoming.push([x, y, z], quat, [a, b, c], f32::from(alpha) / 255.0);
         for (h, byte) in sh.iter_mut().zip([red, green, blue]) {
             *h = dc_from_colour(f64::from(byte) / 255.0);
         }
     }
     let splats = incoming.into_splats(path)?;
-    Ok(Decoded { splats, flavour: "splat".to_owned(), comments: Vec::new() })
+    Decoded::new(splats, "splat".to_owned(), Vec::new(), Vec::new(), path)
 }
 
 /// Writes every Gaussian, sorted by volume times opacity.

@@ -18,8 +18,7 @@
 //! Source: the README and extensions/README of nianticlabs/spz, splat-transform's files.
 
 use super::gaussians::{
-    Decoded, HALF_TURN_X, Incoming, Outgoing, Similarity, check_finite, transform, truncated,
-    u32_at,
+    Decoded, HALF_TURN_X, Incoming, Outgoing, Similarity, transform, truncated, u32_at,
 };
 use super::splat::unit_byte;
 use crate::files::{Error, Result};
@@ -55,12 +54,10 @@ const FRACTION_MAX: i32 = 20;
 ///
 /// # Errors
 /// Another magic or version, a truncated file, a wrong checksum, streams that do not inflate
-/// to the size that the count gives, bytes after the end, a decompression bomb.
+/// to the size that the count gives, bytes after the end, a decompression bomb, no Gaussian with
+/// finite numbers and a rotation.
 pub fn parse_spz(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
-    let name = name.as_ref();
-    let decoded = decode(bytes, name)?;
-    check_finite(&decoded.splats, name)?;
-    Ok(decoded.splats)
+    Ok(decode(bytes, name.as_ref())?.splats)
 }
 
 struct Header {
@@ -142,7 +139,7 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     let by = Similarity { scale: 1.0, rotation: HALF_TURN_X, translation: DVec3::ZERO };
     transform(&mut splats, &by);
     let flavour = format!("spz {}", header.version);
-    Ok(Decoded { splats, flavour, comments: Vec::new() })
+    Decoded::new(splats, flavour, Vec::new(), Vec::new(), path)
 }
 
 /// Reads what follows the Gaussians of versions 1 to 3 to its end, at most `limit` bytes:

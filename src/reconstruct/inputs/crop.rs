@@ -14,6 +14,7 @@
 use super::frame;
 use crate::files::photos::resize::{Filter, Window, resize, resize_window};
 use crate::files::{Error, Result};
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::Vec2;
 use subsplat_kernels::camera::{Camera, CameraError, Intrinsics, Size};
@@ -100,12 +101,16 @@ impl PhotoWindow {
 /// A photograph's input and target.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cropped {
-    /// The network's input.
+    /// The network's input. Masked pixels are filled from those around.
     pub input: Rgb,
+    /// Pixels of `input` that count: those of which more than half of the area does. `None` where all do.
+    pub input_mask: Option<Mask>,
     /// Camera of `input`.
     pub input_camera: Camera,
     /// The photograph at the size of the target: what the rendered picture is compared with.
     pub target: Rgb,
+    /// Pixels of `target` that count, as [`Cropped::input_mask`].
+    pub target_mask: Option<Mask>,
     /// Camera of `target`.
     pub target_camera: Camera,
     /// Position of `target` in the photograph.
@@ -119,6 +124,11 @@ impl Cropped {
         (area(&self.target) / area(&self.input)).sqrt()
     }
 
+    /// Mean of the mean colours of `inputs` where their masks keep them, value / 255.
+    pub fn mean_colour(inputs: &[Self]) -> [f32; 3] {
+        Rgb::mean_colour_of_kept(inputs.iter().map(|c| (&c.input, c.input_mask.as_ref())))
+    }
+
     /// The photograph at `size` instead of the target's, and its camera.
     ///
     /// # Errors
@@ -127,6 +137,12 @@ impl Cropped {
         let k = self.target_camera.intrinsics().resized(width, height);
         let camera = with_intrinsics(&self.target_camera, k)?;
         Ok((resize(&self.target, width, height, Filter::Lanczos), camera))
+    }
+
+    /// The mask of the picture of [`Cropped::resized`]; `None` where all of its pixels count.
+    pub fn resized_mask(&self, Size { width, height }: Size) -> Option<Mask> {
+        let mask = self.target_mask.as_ref()?.resized(width, height);
+        (!mask.keeps_all()).then_some(mask)
     }
 }
 
@@ -187,6 +203,14 @@ impl Plan {
         }
     }
 
+    /// The mask of the window as a picture of `size`.
+    fn mask(&self, photo: &Mask, size: (usize, usize)) -> Mask {
+        let PhotoWindow { scale, origin } = self.window((photo.width(), photo.height()));
+        let extent = Vec2::new(self.size.0 as f32, self.size.1 as f32) * scale;
+        let [origin, extent] = [origin, extent].map(|v| v.as_dvec2().to_array());
+        photo.part(origin, extent, size.0, size.1)
+    }
+
     fn window(&self, photo: (usize, usize)) -> PhotoWindow {
         let full = Vec2::new(self.full.0 as f32, self.full.1 as f32);
         let scale = Vec2::new(photo.0 as f32, photo.1 as f32) / full;
@@ -201,6 +225,19 @@ impl Plan {
 /// A size below one stride or above what a picture may have; a target without pixels; a camera
 /// that is not the photograph's, or whose focal lengths leave the range of f32.
 pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropped> {
+    crop_masked(photo, None, camera, options)
+}
+
+/// [`crop`] of a photograph with a mask of its pixels.
+///
+/// # Errors
+/// Those of [`crop`]; a mask of another size than the photograph's, or that keeps nothing of the crop.
+pub fn crop_masked(
+    photo: &Rgb,
+    mask: Option<&Mask>,
+    camera: &Camera,
+    options: &CropOptions,
+) -> Result<Cropped> {
     let k = &camera.intrinsics();
     let bad = |expected: String, got: String| Err(Error::format("crop", expected, got));
     let stride = options.stride.max(1);
@@ -220,6 +257,12 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
         let expected = format!("target sides of 1 to {SIDE_MAX} pixels (the input is {w}x{h})");
         return bad(expected, format!("{target_w}x{target_h}"));
     }
+    if let Some(mask) = mask.filter(|mask| !mask.fits(photo)) {
+        let expected = format!("a mask of {}x{} pixels", photo.width, photo.height);
+        return bad(expected, format!("{}x{}", mask.width(), mask.height()));
+    }
+    let unmasked = mask.map(|mask| mask.filled(photo));
+    let photo = unmasked.as_ref().unwrap_or(photo);
     let filled = (options.rule == CropRule::Exact).then(|| frame::filled(photo)).flatten();
     let photo = filled.as_ref().unwrap_or(photo);
     let input_size = (w - w % stride, h - h % stride);
@@ -233,20 +276,28 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
     let plan = Plan::new(size, (target_w, target_h), target_size, unit);
     let target = plan.picture(photo);
     let target_k = plan.intrinsics(k, options.rule);
-    let (input, input_k) = match options.lr_from {
+    let (input, input_k, input_plan) = match options.lr_from {
         LrFrom::HrCrop => {
             let reduced = resize(&target, input_size.0, input_size.1, Filter::Lanczos);
-            (reduced, target_k.resized(input_size.0, input_size.1))
+            (reduced, target_k.resized(input_size.0, input_size.1), plan)
         }
         LrFrom::Independent => {
             let plan = Plan::new(size, (w, h), input_size, 1);
-            (plan.picture(photo), plan.intrinsics(k, options.rule))
+            (plan.picture(photo), plan.intrinsics(k, options.rule), plan)
         }
     };
+    let input_mask = mask.map(|mask| input_plan.mask(mask, input_size));
+    let target_mask = mask.map(|mask| plan.mask(mask, target_size));
+    if [&input_mask, &target_mask].into_iter().flatten().any(Mask::keeps_none) {
+        let expected = "a photograph with pixels that are not masked in the part that is used";
+        return bad(expected.to_owned(), "a mask over all of it".to_owned());
+    }
     Ok(Cropped {
         input,
+        input_mask: input_mask.filter(|mask| !mask.keeps_all()),
         input_camera: with_intrinsics(camera, input_k)?,
         target,
+        target_mask: target_mask.filter(|mask| !mask.keeps_all()),
         target_camera: with_intrinsics(camera, target_k)?,
         window: plan.window(size),
     })
@@ -365,6 +416,56 @@ mod tests {
         assert_eq!(shim.input, native.input);
         assert_ne!(shim.input, aligned.input);
         assert_eq!(shim.target, aligned.target);
+    }
+
+    /// The mask is cropped and resized with the picture, and what is masked does not mix into kept pixels.
+    #[test]
+    fn masks_are_cropped_with_their_pictures() {
+        for (w, h, lr_from) in
+            [(576, 320, LrFrom::HrCrop), (100, 90, LrFrom::HrCrop), (333, 500, LrFrom::Independent)]
+        {
+            let (mut picture, camera) = photo(w, h);
+            // A disc in the middle is masked; the rest is grey.
+            let radius = 0.2 * w as f32;
+            let distance = |p: Vec2| (p - 0.5 * Vec2::new(w as f32, h as f32)).length();
+            let at = |i: usize| Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+            let kept: Vec<bool> = (0..w * h).map(|i| distance(at(i)) > radius).collect();
+            for (pixel, kept) in picture.data.chunks_exact_mut(3).zip(&kept) {
+                pixel.fill(if *kept { 120 } else { 0 });
+            }
+            let mask = Mask::new(w, h, kept).unwrap();
+            let options = CropOptions { lr_from, ..CropOptions::new(Size::new(64, 48), 2, 16) };
+            let c = crop_masked(&picture, Some(&mask), &camera, &options).unwrap();
+            let of = |picture: &Rgb, own: &Camera, found: &Mask| {
+                assert!(found.fits(picture) && picture.data.iter().all(|v| *v == 120));
+                let (k, whole) = (own.intrinsics(), camera.intrinsics());
+                for (i, kept) in found.kept().iter().enumerate() {
+                    let px = Vec2::new((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
+                    let there = whole.project(k.unproject(px));
+                    let side = whole.fx / k.fx;
+                    let edge = distance(there) - radius;
+                    assert!(edge.abs() < 1.0 + 0.6 * side || *kept == (edge > 0.0), "{i} {there}");
+                }
+                assert!(found.count() > 100 && !found.keeps_all());
+            };
+            of(&c.input, &c.input_camera, c.input_mask.as_ref().unwrap());
+            of(&c.target, &c.target_camera, c.target_mask.as_ref().unwrap());
+            let size = Size::new(96, 72);
+            let (resized, resized_camera) = c.resized(size).unwrap();
+            of(&resized, &resized_camera, &c.resized_mask(size).unwrap());
+            assert_eq!(Cropped::mean_colour(&[c]), [120.0 / 255.0; 3]);
+            // Without masked pixels nothing changes.
+            let all = Mask::new(w, h, vec![true; w * h]).unwrap();
+            let same = crop_masked(&picture, Some(&all), &camera, &options).unwrap();
+            assert_eq!(same, crop(&picture, &camera, &options).unwrap());
+            // A mask over the part that is used, and one of another size.
+            let none = Mask::new(w, h, vec![false; w * h]).unwrap();
+            let small = Mask::new(2, 2, vec![true; 4]).unwrap();
+            for (mask, words) in [(none, "over all of it"), (small, "got 2x2")] {
+                let error = crop_masked(&picture, Some(&mask), &camera, &options).unwrap_err();
+                assert!(error.to_string().contains(words), "{error}");
+            }
+        }
     }
 
     #[test]

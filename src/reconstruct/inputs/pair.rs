@@ -389,6 +389,7 @@ mod tests {
             distortion: Distortion::None,
             timestamp: None,
             depth: None,
+            mask: None,
             visible: Vec::new(),
         };
         Scene {
@@ -398,6 +399,7 @@ mod tests {
             source: SceneFormat::Pair,
             units: Units::Unknown,
             near_far: None,
+            origin: Default::default(),
             warnings: Vec::new(),
         }
     }

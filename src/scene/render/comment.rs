@@ -4,7 +4,7 @@
 //! are to be seen. Convention, near plane, low-pass and background therefore travel as one comment
 //! line, the camera of the first photograph as another.
 
-use glam::Mat4;
+use glam::{DVec3, Mat4};
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_kernels::layout::{Convention, RasterOptions};
 
@@ -64,9 +64,30 @@ pub fn camera_of_comments(comments: &[String]) -> Option<Camera> {
     Camera::new(Intrinsics { fx, fy, cx, cy, width, height }, pose).ok()
 }
 
+/// First words of the comment of an origin.
+const ORIGIN_PREFIX: &str = "subsplat origin:";
+
+/// Formats the point of another world that is the origin of a file's coordinates
+/// ([`Scene::origin`](crate::files::poses::scene::Scene::origin)), as a comment for a scene file;
+/// [`origin_of_comments`] reads it. `None` for the same world.
+pub fn comment_of_origin(origin: DVec3) -> Option<String> {
+    let DVec3 { x, y, z } = origin;
+    (origin != DVec3::ZERO).then(|| format!("{ORIGIN_PREFIX} {x},{y},{z}"))
+}
+
+/// Reads the origin of a file's comments; zero where no comment holds one.
+pub fn origin_of_comments(comments: &[String]) -> DVec3 {
+    let text = comments.iter().find_map(|c| c.trim().strip_prefix(ORIGIN_PREFIX));
+    let numbers = text.map(|text| text.trim().split(',').map(str::parse::<f64>));
+    let numbers = numbers.and_then(|all| all.collect::<Result<Vec<_>, _>>().ok());
+    let origin = numbers.and_then(|all| Some(DVec3::from(<[f64; 3]>::try_from(all).ok()?)));
+    origin.filter(|origin| origin.is_finite()).unwrap_or_default()
+}
+
 /// Leaves out comments that hold in a file's own axes only.
 pub fn comments_without_camera(comments: &[String]) -> Vec<String> {
-    comments.iter().filter(|c| !c.trim().starts_with(CAMERA_PREFIX)).cloned().collect()
+    let of_axes = |c: &str| c.starts_with(CAMERA_PREFIX) || c.starts_with(ORIGIN_PREFIX);
+    comments.iter().filter(|c| !of_axes(c.trim())).cloned().collect()
 }
 
 /// Reads convention, near plane, low-pass and background from a file's comments; `None` where
@@ -97,6 +118,19 @@ pub fn options_of_comments(comments: &[String]) -> Option<RasterOptions> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_comment_restores_the_origin() {
+        let origin = DVec3::new(691_234.0, 5_411_933.0, -0.5);
+        let comments = ["up is -y".to_owned(), comment_of_origin(origin).unwrap()];
+        assert_eq!(origin_of_comments(&comments), origin);
+        assert_eq!(comment_of_origin(DVec3::ZERO), None);
+        for bad in
+            ["", "subsplat origin: 1,2", "subsplat origin: 1,2,nan", "subsplat origin: a,b,c"]
+        {
+            assert_eq!(origin_of_comments(&[bad.to_owned()]), DVec3::ZERO, "{bad}");
+        }
+    }
 
     #[test]
     fn a_comment_restores_the_options() {

@@ -31,7 +31,7 @@ pub fn workplace() -> tempfile::TempDir {
         cameras.push(named(file, example.cameras[from]));
     }
     let near_far = Some(NearFar::new(example.near, example.far));
-    let content = CameraFile { cameras, units: Units::Unknown, near_far };
+    let content = CameraFile { cameras, units: Units::Unknown, near_far, ..Default::default() };
     save_cameras_json(scene.join("cameras.json"), &content).unwrap();
     folder
 }

@@ -22,7 +22,7 @@ fn scene(folder: &Path, width: usize, height: usize) {
     let cameras = shoot.photos.iter().enumerate().map(frame).collect();
     save_cameras_json(
         folder.join("cameras.json"),
-        &CameraFile { cameras, units: Default::default(), near_far: None },
+        &CameraFile { cameras, units: Default::default(), near_far: None, ..Default::default() },
     )
     .unwrap();
 }

@@ -7,9 +7,9 @@
 //! * `points3D.bin`: u64 n; n × {u64 id, f64 × 3, u8 × 3 RGB, f64 error, u64 m,
 //!   m × {u32 image, u32 index}}
 
-use super::{Cameras, ColmapImage, MODELS, Points, camera, rotation};
+use super::{Cameras, ColmapImage, MODELS, Points, camera, pose};
 use crate::files::{Error, Result};
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use std::path::Path;
 
 /// Id of an observation without a point.
@@ -108,7 +108,8 @@ impl<'a> Cursor<'a> {
 /// Reads `cameras.bin`; `path` is for messages.
 ///
 /// # Errors
-/// Truncated, a camera model that is not read, parameters that are not finite.
+/// Truncated, a camera model of no known number. A model that is not read, and parameters that are not
+/// finite, are errors of that camera.
 pub fn parse_cameras(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Cameras> {
     cameras(path.as_ref(), bytes)
 }
@@ -129,7 +130,7 @@ fn cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
         };
         let parameters =
             (0..count).map(|_| c.f64("a camera parameter")).collect::<Result<Vec<_>>>()?;
-        let camera = camera(name, size, &parameters).map_err(|r| at(c.error(r.expected, r.got)))?;
+        let camera = camera(name, size, &parameters).map_err(|r| at(c.error(r.expected, r.got)));
 
         if cameras.insert(id, camera).is_some() {
             return Err(at(c.error("each camera id once", format!("{id} again"))));
@@ -142,7 +143,7 @@ fn cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
 /// Reads `images.bin`; `path` is for messages.
 ///
 /// # Errors
-/// Truncated, a pose that is not finite, a name that is not UTF-8.
+/// Truncated, a name that is not UTF-8.
 pub fn parse_images(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
     images(path.as_ref(), bytes)
 }
@@ -156,13 +157,11 @@ fn images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
         let place = format!(" at byte {}", c.at);
         c.u32("an image id")?;
         let q = c.f64s::<4>("a quaternion")?;
-        let t = DVec3::from_array(c.f64s::<3>("a translation")?);
+        let t = c.f64s::<3>("a translation")?;
         let camera = c.u32("a camera id")?;
         let name = c.name()?.to_owned();
-        let Some(rotation) = rotation(q).filter(|_| t.is_finite()) else {
-            let got = format!("quaternion {q:?}, translation {t}");
-            return Err(c.error("a finite pose with a quaternion above 0", got).at(place));
-        };
+        let found = pose(q, t);
+        let (rotation, translation) = found.clone().unwrap_or_default();
         let observations = c.count(24, "observations")?;
         let mut points = Vec::new();
         for _ in 0..observations {
@@ -172,7 +171,8 @@ fn images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
                 points.push(id);
             }
         }
-        images.push(ColmapImage { place, rotation, translation: t, camera, name, points });
+        let refused = found.err();
+        images.push(ColmapImage { place, rotation, translation, refused, camera, name, points });
     }
     c.end()?;
     Ok(images)
@@ -194,7 +194,7 @@ fn points(path: &Path, bytes: &[u8]) -> Result<Points> {
         let start = c.at;
         let id = c.u64("a point id")?;
         let position = c.f64s::<3>("a position")?;
-        let p = Vec3::from_array(position.map(|v| v as f32));
+        let p = DVec3::from_array(position);
         if !p.is_finite() {
             let at = format!(" at byte {start}");
             return Err(c.error("a finite position", format!("{position:?}")).at(at));

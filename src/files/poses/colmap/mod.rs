@@ -16,12 +16,13 @@ mod binary;
 mod text;
 mod write;
 
-use super::assemble::{Draft, Lens, assemble, find_image};
+use super::assemble::{Draft, Lens, Pictures, assemble, find_image};
 use super::scene::{Scene, SceneFormat};
 use crate::files::photos::undistort::Distortion;
 use crate::files::{Error, Result, read};
-use glam::{DMat4, DQuat, DVec3, Vec3};
+use glam::{DMat4, DQuat, DVec3};
 use std::collections::HashMap;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 pub use binary::parse_points as parse_points_bin;
@@ -53,6 +54,8 @@ pub struct ColmapImage {
     pub rotation: DQuat,
     /// Translation, camera from world.
     pub translation: DVec3,
+    /// The file's numbers where they are no pose; rotation and translation are then those of the world.
+    pub refused: Option<String>,
     /// Key into the cameras.
     pub camera: u32,
     /// Path below the picture folder.
@@ -61,10 +64,23 @@ pub struct ColmapImage {
     pub points: Vec<u64>,
 }
 
-/// Cameras by id.
-pub type Cameras = HashMap<u32, ColmapCamera>;
+/// Cameras by id. One that is not read is an error of the pictures that have it.
+pub type Cameras = HashMap<u32, Result<ColmapCamera>>;
 /// Id and position of each point.
-pub type Points = Vec<(u64, Vec3)>;
+pub type Points = Vec<(u64, DVec3)>;
+
+/// Number of pictures that the model in `folder` states; 0 where it cannot be read.
+pub(super) fn count_images(folder: &Path) -> usize {
+    let binary = folder.join("images.bin");
+    if folder.join("cameras.bin").is_file() && binary.is_file() {
+        let mut count = [0; 8];
+        let read = std::fs::File::open(binary).and_then(|mut file| file.read_exact(&mut count));
+        return read.map_or(0, |()| u64::from_le_bytes(count) as usize);
+    }
+    let path = folder.join("images.txt");
+    let bytes = read(&path).unwrap_or_default();
+    parse_images_txt(&path, &bytes, &mut Vec::new()).map_or(0, |images| images.len())
+}
 
 /// Reports whether `folder` holds a model.
 pub(super) fn is_model(folder: &Path) -> bool {
@@ -162,16 +178,22 @@ fn camera(
     Ok(ColmapCamera { width, height, focal_and_center, distortion })
 }
 
-/// Normalises the file's quaternion w, x, y, z.
-fn rotation(q: [f64; 4]) -> Option<DQuat> {
+/// Rotation and translation of the file's quaternion w, x, y, z and translation.
+///
+/// # Errors
+/// Numbers that are no pose, as text.
+fn pose(q: [f64; 4], t: [f64; 3]) -> std::result::Result<(DQuat, DVec3), String> {
     let quat = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
-    let length = quat.length();
-    (length.is_finite() && length > 1e-6).then(|| quat * (1.0 / length))
+    let (length, translation) = (quat.length(), DVec3::from_array(t));
+    if length.is_finite() && length > 1e-6 && translation.is_finite() {
+        return Ok((quat * (1.0 / length), translation));
+    }
+    Err(format!("quaternion {q:?}, translation {t:?}"))
 }
 
 /// Reads the model in `folder`. Pictures may lie beside it, in its parents, and in an
 /// `images` folder of any of them.
-pub(super) fn load(folder: &Path) -> Result<Scene> {
+pub(super) fn load(folder: &Path, pictures: Pictures) -> Result<Scene> {
     let binary = folder.join("cameras.bin").is_file() && folder.join("images.bin").is_file();
     let extension = if binary { "bin" } else { "txt" };
     let path = |stem: &str| folder.join(format!("{stem}.{extension}"));
@@ -212,8 +234,10 @@ pub(super) fn load(folder: &Path) -> Result<Scene> {
         .into_iter()
         .map(|image| draft(&images_path, image, &cameras, &index, &roots))
         .collect::<Result<Vec<_>>>()?;
-    let mut scene = assemble(&images_path, SceneFormat::Colmap, drafts)?;
-    scene.points = (!points.is_empty()).then(|| points.into_iter().map(|(_, p)| p).collect());
+    let mut scene = assemble(&images_path, SceneFormat::Colmap, pictures, drafts)?;
+    let origin = scene.origin;
+    let place = |(_, p): (u64, DVec3)| (p - origin).as_vec3();
+    scene.points = (!points.is_empty()).then(|| points.into_iter().map(place).collect());
     warnings.append(&mut scene.warnings);
     scene.warnings = warnings;
     Ok(scene)
@@ -226,10 +250,18 @@ fn draft(
     index: &HashMap<u64, u32>,
     roots: &[&Path],
 ) -> Result<Draft> {
-    let Some(camera) = cameras.get(&image.camera) else {
-        let got = format!("camera {}", image.camera);
-        return Err(Error::format(path, "a camera id of the cameras file", got).at(image.place));
+    let camera = match cameras.get(&image.camera) {
+        Some(Ok(camera)) => camera,
+        Some(Err(error)) => return Ok(Draft::refused(image.name, error.copy())),
+        None => {
+            let got = format!("camera {}", image.camera);
+            return Err(Error::format(path, "a camera id of the cameras file", got).at(image.place));
+        }
     };
+    if let Some(got) = image.refused {
+        let error = Error::format(path, "a finite pose with a quaternion above 0", got);
+        return Ok(Draft::refused(image.name, error.at(image.place)));
+    }
     // The inverse of (R, t): (Rᵀ, −Rᵀt).
     let back = image.rotation.conjugate();
     let pose = DMat4::from_rotation_translation(back, -(back * image.translation));

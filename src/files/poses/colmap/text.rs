@@ -5,11 +5,11 @@
 //!   X Y POINT3D_ID triples, which may be empty, and which some exporters leave out
 //! * `points3D.txt`: POINT3D_ID X Y Z R G B ERROR TRACK…
 
-use super::{Cameras, ColmapImage, MODELS, Points, camera, rotation};
+use super::{Cameras, ColmapCamera, ColmapImage, MODELS, Points, camera, pose};
 use crate::files::{Error, Result};
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use std::path::Path;
-use std::str::FromStr;
+use std::str::{FromStr, SplitAsciiWhitespace};
 
 /// A line with its number, for messages.
 #[derive(Clone, Copy)]
@@ -29,17 +29,28 @@ impl Line<'_> {
         word.parse().map_err(|_| self.error(what, format!("`{}`", shown(word))))
     }
 
+    /// Numbers, of which those that other languages write for no number are not a number.
     fn numbers<const N: usize>(
         &self,
-        words: &mut std::str::SplitAsciiWhitespace<'_>,
+        words: &mut SplitAsciiWhitespace<'_>,
         what: &str,
     ) -> Result<[f64; N]> {
         let mut values = [0.0; N];
         for v in &mut values {
-            *v = self.number(words.next(), what)?;
+            let word = words.next();
+            *v = match word {
+                Some(word) if is_no_number(word) => f64::NAN,
+                word => self.number(word, what)?,
+            };
         }
         Ok(values)
     }
+}
+
+/// Returns whether a word is no number in the way of C libraries: `-nan(ind)`, `1.#QNAN`, `-1.#IND`.
+fn is_no_number(word: &str) -> bool {
+    let word = word.trim_start_matches(['-', '+']).to_ascii_lowercase();
+    word.starts_with("nan") || word.starts_with("1.#")
 }
 
 /// Returns the start of a word, which may be megabytes long.
@@ -65,7 +76,8 @@ fn records<'a>(path: &'a Path, bytes: &'a [u8]) -> Result<impl Iterator<Item = L
 /// Reads `cameras.txt`; `path` is for messages.
 ///
 /// # Errors
-/// A line that does not parse, a camera model that is not read.
+/// A line without an id, an id twice. A camera model that is not read, and parameters that do not parse, are
+/// errors of that camera.
 pub fn parse_cameras(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Cameras> {
     cameras(path.as_ref(), bytes)
 }
@@ -75,23 +87,7 @@ fn cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
     for line in records(path, bytes)? {
         let mut words = line.text.split_ascii_whitespace();
         let id: u32 = line.number(words.next(), "a camera id")?;
-        let model = words.next().unwrap_or("");
-        let Some(&(model, count)) = MODELS.iter().find(|m| m.0 == model) else {
-            return Err(line.error(super::MODELS_READ, format!("`{}`", shown(model))));
-        };
-        let size = [
-            line.number(words.next(), "a width in pixels")?,
-            line.number(words.next(), "a height in pixels")?,
-        ];
-        let parameters = words
-            .map(|w| line.number(Some(w), "a camera parameter"))
-            .collect::<Result<Vec<f64>>>()?;
-        if parameters.len() != count {
-            let expected = format!("{count} parameters of {model}");
-            return Err(line.error(expected, parameters.len().to_string()));
-        }
-        let camera = camera(model, size, &parameters).map_err(|r| line.error(r.expected, r.got))?;
-        if cameras.insert(id, camera).is_some() {
+        if cameras.insert(id, camera_of(line, words)).is_some() {
             return Err(line.error("each camera id once", format!("{id} again")));
         }
     }
@@ -99,6 +95,25 @@ fn cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
         return Err(Error::format(path, "at least one camera", "none"));
     }
     Ok(cameras)
+}
+
+/// The camera of a line, from the words after its id.
+fn camera_of(line: Line<'_>, mut words: SplitAsciiWhitespace<'_>) -> Result<ColmapCamera> {
+    let model = words.next().unwrap_or("");
+    let Some(&(model, count)) = MODELS.iter().find(|m| m.0 == model) else {
+        return Err(line.error(super::MODELS_READ, format!("`{}`", shown(model))));
+    };
+    let size = [
+        line.number(words.next(), "a width in pixels")?,
+        line.number(words.next(), "a height in pixels")?,
+    ];
+    let parameters =
+        words.map(|w| line.number(Some(w), "a camera parameter")).collect::<Result<Vec<f64>>>()?;
+    if parameters.len() != count {
+        let expected = format!("{count} parameters of {model}");
+        return Err(line.error(expected, parameters.len().to_string()));
+    }
+    camera(model, size, &parameters).map_err(|r| line.error(r.expected, r.got))
 }
 
 /// Parses the point ids of a line of X Y POINT3D_ID triples; `None` for another line.
@@ -120,7 +135,7 @@ fn observations(text: &str) -> Option<Vec<u64>> {
 /// warning.
 ///
 /// # Errors
-/// A line that does not parse, a pose that is not finite.
+/// A line that does not parse.
 pub fn parse_images(
     path: impl AsRef<Path>,
     bytes: &[u8],
@@ -168,7 +183,7 @@ fn image(line: Line<'_>) -> Result<ColmapImage> {
     let mut words = line.text.split_ascii_whitespace();
     line.number::<u32>(words.next(), "an image id")?;
     let q = line.numbers::<4>(&mut words, "a quaternion QW QX QY QZ")?;
-    let t = DVec3::from_array(line.numbers::<3>(&mut words, "a translation TX TY TZ")?);
+    let t = line.numbers::<3>(&mut words, "a translation TX TY TZ")?;
     let camera = line.number(words.next(), "a camera id")?;
     // A name may contain runs of spaces.
 
@@ -181,12 +196,10 @@ fn image(line: Line<'_>) -> Result<ColmapImage> {
     if name.is_empty() {
         return Err(line.error("a picture name", "the end of the line"));
     }
-    let Some(rotation) = rotation(q).filter(|_| t.is_finite()) else {
-        let got = format!("quaternion {q:?}, translation {t}");
-        return Err(line.error("a finite pose with a quaternion above 0", got));
-    };
-    let place = format!(":{}", line.number);
-    Ok(ColmapImage { place, rotation, translation: t, camera, name, points: Vec::new() })
+    let found = pose(q, t);
+    let (rotation, translation) = found.clone().unwrap_or_default();
+    let (refused, place, points) = (found.err(), format!(":{}", line.number), Vec::new());
+    Ok(ColmapImage { place, rotation, translation, refused, camera, name, points })
 }
 
 /// Reads `points3D.txt`; `path` is for messages.
@@ -203,7 +216,7 @@ fn points(path: &Path, bytes: &[u8]) -> Result<Points> {
         let mut words = line.text.split_ascii_whitespace();
         let id = line.number(words.next(), "a point id")?;
         let position = line.numbers::<3>(&mut words, "a position X Y Z")?;
-        let p = Vec3::from_array(position.map(|v| v as f32));
+        let p = DVec3::from_array(position);
         if !p.is_finite() {
             return Err(line.error("a finite position", format!("{position:?}")));
         }

@@ -8,8 +8,8 @@ use serde_json::json;
 use subsplat::cameras::check::{
     CheckOptions, GrayImage, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
 };
-use subsplat::files::photos::image::save_png;
-use subsplat::files::poses::scene::Scene;
+use subsplat::files::photos::image::{LoadOptions, save_png};
+use subsplat::files::poses::scene::{LoadedFrame, Scene};
 use subsplat::reconstruct::inputs::pair::choose_pair;
 use subsplat::scene::pictures::Rgb;
 
@@ -90,23 +90,28 @@ fn pairs(args: &CheckArgs, scene: &Scene) -> Result<Vec<[usize; 2]>> {
 }
 
 fn judge(scene: &Scene, i: usize, j: usize) -> Result<(PairReport, Option<Rgb>)> {
-    let (a, camera_a) = scene.frames[i].load()?;
-    let (b, camera_b) = scene.frames[j].load()?;
+    let [a, b] = [i, j].map(|i| scene.frames[i].load_with(&LoadOptions::default()));
+    let (a, b) = (a?, b?);
+    let (camera_a, camera_b) = (a.camera, b.camera);
     let options = CheckOptions::default();
     let report = check_pair(&grey(&a)?, &camera_a, &grey(&b)?, &camera_b, &options);
     fn picture(p: &Rgb) -> RgbPicture<'_> {
         RgbPicture { width: p.width, height: p.height, pixels: &p.data }
     }
-    let drawn =
-        epipolar_picture([picture(&a), picture(&b)], [&camera_a, &camera_b], &report.points)
-            .map(|(width, height, data)| Rgb { width, height, data });
+    let drawn = epipolar_picture(
+        [picture(&a.picture), picture(&b.picture)],
+        [&camera_a, &camera_b],
+        &report.points,
+    )
+    .map(|(width, height, data)| Rgb { width, height, data });
     Ok((report, drawn))
 }
 
 /// Grey copy of a photograph.
-fn grey(photo: &Rgb) -> Result<GrayImage> {
-    GrayImage::from_rgb8(photo.width, photo.height, &photo.data)
-        .with_context(|| format!("picture of {}x{} pixels", photo.width, photo.height))
+fn grey(photo: &LoadedFrame) -> Result<GrayImage> {
+    let Rgb { width, height, .. } = photo.picture;
+    GrayImage::from_picture(&photo.picture, photo.mask.as_ref())
+        .with_context(|| format!("picture of {width}x{height} pixels"))
 }
 
 fn verdict_name(verdict: Verdict) -> &'static str {

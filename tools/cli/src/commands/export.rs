@@ -7,10 +7,10 @@ use crate::report::{Answer, Progress, print_warning};
 use anyhow::{Result, bail};
 use serde_json::json;
 use subsplat::files::splats::ply::is_own_comment;
-use subsplat::files::{SaveOptions, load_with_comments, save_splats};
+use subsplat::files::{SaveOptions, save_splats};
 use subsplat::finish::reduce;
 use subsplat::scene::render::{
-    Renderer, camera_of_comments, comments_without_camera, options_of_comments,
+    Renderer, camera_of_comments, comments_without_camera, options_of_comments, origin_of_comments,
 };
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{Convention, RasterOptions};
@@ -26,14 +26,14 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             args.out.display()
         );
     }
-    let (mut splats, mut comments) = progress.stage("scene", |_| load_with_comments(&file))?;
+    let (mut splats, mut comments) = progress.stage("scene", |_| render::load(&file))?;
     comments.retain(|comment| !is_own_comment(comment));
     let stored = options_of_comments(&comments);
     let all = splats.len();
     // cameras.json of `run` holds the views, the comment the first photograph.
     let own = camera_of_comments(&comments);
     let beside = if html || args.gaussians.is_some() {
-        render::cameras_beside(args.cameras.as_deref(), &file)?
+        render::cameras_beside(args.cameras.as_deref(), &file, origin_of_comments(&comments))?
     } else {
         None
     };

@@ -5,11 +5,11 @@ use anyhow::{Context, Result, bail, ensure};
 use glam::{Mat4, Quat, Vec3};
 use std::path::Path;
 use subsplat::files::poses::protocol::{Views, load_protocol};
-use subsplat::files::poses::scene::Scene;
+use subsplat::files::poses::scene::{Scene, frame_name};
 use subsplat_kernels::camera::Camera;
 
 fn stem(file: &str) -> String {
-    Path::new(file).file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    frame_name(file).rsplit('/').next().unwrap_or_default().to_owned()
 }
 
 /// Finds the frames that the words of `flag` name: by index, or by name with or without folder
@@ -22,10 +22,9 @@ pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>
         {
             return Ok(i);
         }
-        if let Some(i) = frames.iter().position(|f| f == word) {
-            return Ok(i);
-        }
-        let mut same = (0..frames.len()).filter(|&i| stem(frames[i]) == stem(word));
+        let exact = frames.iter().any(|f| f == word);
+        let is_same = |f: &str| if exact { f == word } else { stem(f) == stem(word) };
+        let mut same = (0..frames.len()).filter(|&i| is_same(frames[i]));
         let found = same.next().with_context(|| {
             format!(
                 "{flag}: expected a number below {} or a photograph's name, got `{word}`",

@@ -69,6 +69,7 @@ fn splats(path: &Path, answer: Answer) -> Result<Value> {
         "  {} splats are invisible, {} have numbers that are not finite",
         info.invisible, info.non_finite
     ));
+    info.notes.iter().for_each(|note| answer.line(format!("  warning: {note}")));
     info.comments.iter().for_each(|c| answer.line(format!("  comment: {c}")));
     Ok(json!({ "kind": "splats", "file": path.display().to_string(), "splats": info }))
 }

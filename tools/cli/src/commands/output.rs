@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::files::photos::image::{save_depth_png, save_png};
 use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::files::poses::scene::{Scene, Units, is_scene};
+use subsplat::files::poses::scene::{Scene, is_scene};
 use subsplat::files::{SaveOptions, save_splats};
 use subsplat::network::config::Config;
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
@@ -212,7 +212,8 @@ impl Views<'_> {
             View::Frame(i) => {
                 let cropped = Photo::from_frame(&self.scene.frames[*i])?.crop(&self.crop)?;
                 let enlarged = cropped.window.scale.min_element() < 1.0;
-                (cropped.target_camera, Some((*i, cropped.target, enlarged)))
+                let truth = (cropped.target, cropped.target_mask);
+                (cropped.target_camera, Some((*i, truth, enlarged)))
             }
         };
         let picture = renderer.render(result.splats(), &camera, &self.options);
@@ -235,11 +236,19 @@ impl Views<'_> {
             ssim: None,
             enlarged: false,
         };
-        if let Some((frame, truth, enlarged)) = truth {
+        if let Some((frame, (truth, mask), enlarged)) = truth {
             let truth = truth.to_unit();
             scored.frame = Some(frame);
-            scored.psnr = Some(psnr(&picture.rgb, &truth, width, height)?);
-            scored.ssim = ssim(&picture.rgb, &truth, width, height).ok();
+            // PSNR of the pixels that a mask keeps; masked ones count as equal in the windows of SSIM.
+            scored.psnr = Some(match &mask {
+                None => psnr(&picture.rgb, &truth, width, height)?,
+                Some(mask) => {
+                    psnr(&mask.kept_of(&picture.rgb), &mask.kept_of(&truth), mask.count(), 1)?
+                }
+            });
+            let merged = mask.map(|mask| mask.merged(&picture.rgb, &truth));
+            let seen = merged.as_deref().unwrap_or(&picture.rgb);
+            scored.ssim = ssim(seen, &truth, width, height).ok();
             scored.enlarged = enlarged;
         }
         Ok(scored)
@@ -247,13 +256,14 @@ impl Views<'_> {
 }
 
 /// Writes `cameras.json` of the rendered views, in the scene's unit, with near and far.
-pub fn write_cameras(out: &Path, views: &[Scored], units: Units, near_far: NearFar) -> Result<()> {
+pub fn write_cameras(out: &Path, views: &[Scored], scene: &Scene, near_far: NearFar) -> Result<()> {
     let camera = |v: &Scored| NamedCamera {
         depth: Some(format!("depth/{}.png", v.stem)),
         ..NamedCamera::new(format!("images/{}.png", v.stem), v.camera)
     };
     let cameras = views.iter().map(camera).collect();
-    let content = CameraFile { cameras, units, near_far: Some(near_far) };
+    let Scene { units, origin, .. } = *scene;
+    let content = CameraFile { cameras, units, near_far: Some(near_far), origin };
     Ok(save_cameras_json(out.join("cameras.json"), &content)?)
 }
 

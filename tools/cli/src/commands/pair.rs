@@ -1,17 +1,19 @@
 //! The scene of the command line: a scene's path, or photographs with given or estimated cameras.
 
 use super::args::{PairArgs, PoseConventionArg};
-use crate::report::print_line;
+use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
 use subsplat::cameras::estimation::{Confidence, PoseOptions, Uncertain};
+use subsplat::files::photos::folder::{FolderPhotographs, find_photographs};
 use subsplat::files::photos::image::{LoadOptions, Truncated, probe};
-use subsplat::files::photos::photograph::{PhotographHeader, list_photographs, probe_photograph};
+use subsplat::files::photos::photograph::{PhotographHeader, probe_photograph};
+use subsplat::files::poses::find::{folders, is_own_output, not_read};
 use subsplat::files::poses::matrices;
 use subsplat::files::poses::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
-use subsplat::files::poses::scene::{Scene, SceneFormat, is_scene, load_scene};
+use subsplat::files::poses::scene::{Scene, SceneFormat, has_scene, load_scene};
 use subsplat::reconstruct::KnownLens;
 use subsplat::{EstimateOptions, EstimatedScene, estimate_cameras_of_files};
 use subsplat_kernels::camera::{Camera, Intrinsics};
@@ -54,24 +56,23 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
     Ok(matrices::load(folder_of(one), convention.into())?)
 }
 
-/// The photographs that `input` names: two or more files, or a folder without cameras. `None` for
-/// a scene.
+/// The photographs that `input` names: two or more files and folders, or a folder without cameras. `None`
+/// for a scene.
 ///
 /// # Errors
-/// One photograph; a file among several that is no picture.
+/// One photograph; a file among several that is no picture; pictures that `subsplat run` rendered.
 pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
+    for folder in input.iter().filter(|path| is_own_output(path)) {
+        bail!(
+            "{}: expected photographs, got pictures that subsplat rendered; give the photographs, or open \
+             the scene with `subsplat view {}`",
+            folder.display(),
+            folder.join("scene.ply").display()
+        );
+    }
     if let [one] = input {
-        if one.is_dir() && !is_scene(one) {
-            let found = list_photographs(one);
-            ensure!(
-                found.len() >= 2,
-                "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a \
-                 RealEstate10K txt, or poses.txt with K.txt) or a folder of at least 2 photographs, \
-                 got {} photograph(s) and no cameras",
-                one.display(),
-                found.len()
-            );
-            return Ok(Some(found));
+        if one.is_dir() && !has_scene(one) {
+            return of_folder(one).map(Some);
         }
         let is_picture = one.is_file() && probe(one).is_ok();
         ensure!(
@@ -81,10 +82,68 @@ pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
         );
         return Ok(None);
     }
+    let mut all = Vec::with_capacity(input.len());
     for path in input {
-        probe(path)?;
+        if path.is_dir() {
+            let found = find_photographs(path);
+            found
+                .notes()
+                .iter()
+                .for_each(|note| print_warning(format!("{}: {note}", path.display())));
+            ensure!(
+                !found.photographs.is_empty(),
+                "{}: expected photographs, got none",
+                path.display()
+            );
+            all.extend(found.photographs);
+        } else {
+            probe(path)?;
+            all.push(path.clone());
+        }
     }
-    Ok(Some(input.to_vec()))
+    Ok(Some(all))
+}
+
+/// The photographs of a folder without cameras, or of the one folder below it that has some.
+fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
+    let mut found = find_photographs(folder);
+    let mut name = folder.to_owned();
+    let mut below: Vec<(PathBuf, FolderPhotographs)> = Vec::new();
+    if found.photographs.is_empty() {
+        let photographs = |below: &PathBuf| !is_own_output(below) && !below.ends_with("masks");
+        let folders = folders(folder).into_iter().filter(photographs);
+        below = folders.map(|folder| (folder.clone(), find_photographs(&folder))).collect();
+        below.retain(|(_, found)| !found.photographs.is_empty());
+        if below.len() == 1 {
+            (name, found) = below.remove(0);
+            print_line(format!("the photographs are those of {}", name.display()));
+        }
+    }
+    found.notes().iter().for_each(|note| print_warning(format!("{}: {note}", name.display())));
+    if let Some(cameras) = not_read(folder) {
+        print_warning(cameras);
+    }
+    let deeper: Vec<String> = below
+        .iter()
+        .map(|(folder, found)| {
+            format!("{} ({} photographs)", folder.display(), found.photographs.len())
+        })
+        .collect();
+    ensure!(
+        deeper.is_empty(),
+        "{}: expected photographs, got folders of photographs: give one of them, or several if they show one \
+         place: {}",
+        folder.display(),
+        deeper.join(", ")
+    );
+    ensure!(
+        found.photographs.len() >= 2,
+        "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a RealEstate10K txt, or \
+         poses.txt with K.txt) or a folder of at least 2 photographs, got {} photograph(s) and no cameras",
+        folder.display(),
+        found.photographs.len()
+    );
+    Ok(found.photographs)
 }
 
 /// Arguments of an estimation of cameras.

@@ -3,7 +3,7 @@
 use super::args::PosesArgs;
 use super::pair::{self, EstimateRequest};
 use crate::report::{Answer, Progress, peak_memory_bytes, print_warning};
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use subsplat::EstimatedScene;
@@ -11,7 +11,7 @@ use subsplat::cameras::estimation::Confidence;
 use subsplat::files::poses::cameras_json::save_cameras_and_points;
 use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera};
 use subsplat::files::poses::colmap::{SparsePoint, save_colmap};
-use subsplat::files::poses::scene::Units;
+use subsplat::files::poses::scene::{Units, distinct_names};
 use subsplat_kernels::camera::Camera;
 
 /// Runs the command.
@@ -20,6 +20,7 @@ pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
     let photographs = pair::photographs(&args.input)?.with_context(|| {
         format!("{}: expected photographs, got a scene with cameras", args.input[0].display())
     })?;
+    check_names(&photographs)?;
     let request = EstimateRequest {
         fov: args.fov,
         intrinsics: args.intrinsics.as_deref(),
@@ -46,7 +47,8 @@ fn write(out: &Path, estimated: &EstimatedScene) -> Result<Vec<PathBuf>> {
         .iter()
         .map(|f| Ok(NamedCamera::of_frame(f, path_from(folder, &f.image)?)))
         .collect::<Result<Vec<_>>>()?;
-    let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+    let content =
+        CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() };
     let points = estimated.scene.points.as_deref().unwrap_or_default();
     save_cameras_and_points(&file, &content, points)?;
     let model = folder.join("sparse/0");
@@ -67,11 +69,31 @@ fn path_from(folder: &Path, picture: &Path) -> Result<String> {
     Ok(path.to_string_lossy().replace('\\', "/"))
 }
 
-/// Images and points of COLMAP's model. Names are file names: COLMAP's programs get the folder of
-/// the photographs as their image path.
+/// Refuses names that a pose file cannot hold, before the work.
+fn check_names(photographs: &[PathBuf]) -> Result<()> {
+    for path in photographs {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let holds = path.to_str().is_some()
+            && name.trim() == name
+            && !name.contains(['\n', '\r'])
+            && (cfg!(windows) || !name.contains('\\'));
+        ensure!(
+            holds,
+            "{}: expected a name in UTF-8 without backslashes, line breaks and spaces at its ends, which pose \
+             files can hold; rename the photograph",
+            path.display()
+        );
+    }
+    Ok(())
+}
+
+/// Images and points of COLMAP's model. Names are those of the files, or paths below the folder that all
+/// photographs have in common: COLMAP's programs get that folder as their image path.
 fn colmap(estimated: &EstimatedScene) -> (Vec<(String, Camera)>, Vec<SparsePoint>) {
-    let name = |p: &Path| p.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let images = estimated.scene.frames.iter().map(|f| (name(&f.image), f.camera)).collect();
+    let frames = &estimated.scene.frames;
+    let names = distinct_names(frames.iter().map(|f| f.image.as_path()));
+    let name = |name: PathBuf| name.to_string_lossy().replace('\\', "/");
+    let images = names.into_iter().map(name).zip(frames.iter().map(|f| f.camera)).collect();
     let placed: Vec<usize> = (0..estimated.estimate.cameras.len())
         .filter(|&i| estimated.estimate.cameras[i].is_some())
         .collect();

@@ -8,15 +8,18 @@ use super::{video, whole};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
+use glam::{DVec3, Mat4, Vec3};
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use subsplat::files::load_with_comments;
+use subsplat::files::load_splat_file;
 use subsplat::files::photos::image::{probe, save_depth_png, save_png};
 use subsplat::files::photos::photograph::list_photographs;
-use subsplat::files::poses::cameras_json::{is_cameras_json, load_cameras_json};
-use subsplat::files::poses::scene::{is_scene, load_scene};
+use subsplat::files::poses::cameras_json::is_cameras_json;
+use subsplat::files::poses::scene::{is_scene, load_cameras, load_scene};
 use subsplat::scene::pictures::{Depth, Rgb};
-use subsplat::scene::render::{Renderer, camera_of_comments, options_of_comments};
+use subsplat::scene::render::{
+    Renderer, camera_of_comments, options_of_comments, origin_of_comments,
+};
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_kernels::layout::{Convention, RasterOptions};
@@ -34,10 +37,10 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     args.size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
     args.motion.video.as_deref().map_or(Ok(()), video::check)?;
     let file = scene_file(&args.scene)?;
-    let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
+    let (splats, comments) = progress.stage("scene", |_| load(&file))?;
     let cameras = cameras(args, &file, &splats, &comments)?;
     check_sizes(&cameras)?;
-    let options = options(&args.rendering, args.near, args.sh_degree, &comments)?;
+    let options = options(&args.rendering, args.near, args.sh_degree, &splats, &comments)?;
     let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
     std::fs::create_dir_all(&folder)
         .with_context(|| format!("output folder {}", folder.display()))?;
@@ -99,6 +102,13 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     }))
 }
 
+/// Splats and comments of a scene file. Prints as warnings what was left out, applied or not read.
+pub fn load(file: &Path) -> Result<(Splats, Vec<String>)> {
+    let content = load_splat_file(file)?;
+    content.notes.iter().for_each(print_warning);
+    Ok((content.splats, content.comments))
+}
+
 /// Finds the scene file of `path`: the path itself, or the file in a folder that `run` wrote.
 pub fn scene_file(path: &Path) -> Result<PathBuf> {
     if !path.is_dir() {
@@ -141,12 +151,17 @@ fn check_sizes(cameras: &[(String, Camera)]) -> Result<()> {
     Ok(())
 }
 
-/// Rules to render a scene file: the arguments, then the comment that `run` wrote, then the
+/// Nearest plane of a scene without rules of its own, at most, in units of half the diagonal of its splats:
+/// the standard plane of 0.01 would cut a scene in kilometres.
+const NEAR_SHARE: f32 = 0.02;
+
+/// Rules to render the splats of a file: the arguments, then the comment that `run` wrote, then the
 /// standard.
 pub fn options(
     args: &RenderingArgs,
     near: Option<f32>,
     sh_degree: usize,
+    splats: &Splats,
     comments: &[String],
 ) -> Result<RasterOptions> {
     let stored = options_of_comments(comments);
@@ -154,7 +169,11 @@ pub fn options(
     // Options of one convention do not apply to the other.
     let mut options = match stored.filter(|s| wanted.is_none_or(|w| w == s.convention)) {
         Some(stored) => stored,
-        None => RasterOptions::new(wanted.unwrap_or(Convention::Standard)),
+        None => {
+            let standard = RasterOptions::new(wanted.unwrap_or(Convention::Standard));
+            let most = whole::bounds(splats).map_or(f32::INFINITY, |b| NEAR_SHARE * b.radius());
+            RasterOptions { near: standard.near.min(most), ..standard }
+        }
     };
     options.near = near.unwrap_or(options.near);
     options.sh_degree = sh_degree;
@@ -213,7 +232,8 @@ fn named_cameras(
     splats: &Splats,
     comments: &[String],
 ) -> Result<Vec<(String, Camera)>> {
-    let Some(all) = cameras_beside(args.cameras.as_deref(), file)? else {
+    let origin = origin_of_comments(comments);
+    let Some(all) = cameras_beside(args.cameras.as_deref(), file, origin)? else {
         ensure!(
             args.target.is_empty(),
             "--target: expected --cameras, or cameras.json beside the scene, got neither"
@@ -244,36 +264,42 @@ fn named_cameras(
     Ok(frames::file_stems(&names).into_iter().zip(cameras).collect())
 }
 
-/// Names and cameras of `given`, else of cameras.json beside the scene `file`; `None` without
-/// either.
-pub fn cameras_beside(given: Option<&Path>, file: &Path) -> Result<Option<Vec<(String, Camera)>>> {
+/// Names and cameras of `given`, else of cameras.json beside the scene `file`, in the world of the splats
+/// ([`read_cameras`]); `None` without either.
+pub fn cameras_beside(
+    given: Option<&Path>,
+    file: &Path,
+    origin: DVec3,
+) -> Result<Option<Vec<(String, Camera)>>> {
     let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
     let source = match given {
         Some(path) => path,
         None if beside.is_file() => &beside,
         None => return Ok(None),
     };
-    let all = read_cameras(source)?;
+    let all = read_cameras(source, origin)?;
     ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
     Ok(Some(all))
 }
 
-/// Names and cameras of a pose file or scene folder.
-pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
+/// Names and cameras of a pose file or scene folder, whose pictures need not exist. They are moved to the
+/// world whose origin is `origin`, that of the splats.
+pub fn read_cameras(source: &Path, origin: DVec3) -> Result<Vec<(String, Camera)>> {
     let inside = source.join("cameras.json");
     let list = if inside.is_file() { &inside } else { source };
-    // A camera list needs no pictures; any other pose file goes through its reader.
-    if list.is_file() && is_cameras_json(list)? {
-        let content = load_cameras_json(list)?;
-        let name = |file: &str| {
-            let file = file.strip_prefix("images/").unwrap_or(file);
-            Path::new(file).with_extension("").to_string_lossy().into_owned()
-        };
-        return Ok(content.cameras.iter().map(|c| (name(&c.file), c.camera)).collect());
-    }
-    let scene = load_scene(source)?;
+    // A camera list needs no pictures; another pose file may have pictures of another size.
+    let scene = if list.is_file() && is_cameras_json(list)? {
+        load_cameras(list)?
+    } else {
+        load_scene(source).or_else(|_| load_cameras(source))?
+    };
     scene.warnings.iter().for_each(print_warning);
-    scene.frames.iter().map(|f| Ok((f.name.clone(), f.pinhole()?))).collect()
+    let by = (scene.origin - origin).as_vec3();
+    let moved = |camera: Camera| -> Result<Camera> {
+        let pose = Mat4::from_translation(by) * camera.world_from_camera();
+        Ok(if by == Vec3::ZERO { camera } else { Camera::new(camera.intrinsics(), pose)? })
+    };
+    scene.frames.iter().map(|f| Ok((f.name.clone(), moved(f.pinhole()?)?))).collect()
 }
 
 /// Spread of the splats in front of `camera`.

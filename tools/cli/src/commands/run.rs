@@ -19,7 +19,7 @@ use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
 use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
 use subsplat::scene::pictures::Rgb;
-use subsplat::scene::render::{comment_of_camera, comment_of_options};
+use subsplat::scene::render::{comment_of_camera, comment_of_options, comment_of_origin};
 use subsplat::scene::score::{GaussianReport, InputReport, Score};
 use subsplat::scene::splats::{SplatStatistics, Splats};
 use subsplat::{
@@ -94,7 +94,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let files = progress.stage("writing", |_| {
         output::write_config(&args.out, model.config())?;
         let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
-        let comments = std::iter::once(comment_of_options(&options)).chain(camera).collect();
+        let origin = comment_of_origin(plan.scene.origin);
+        let comments = std::iter::once(comment_of_options(&options));
+        let comments = comments.chain(camera).chain(origin).collect();
         let save = SaveOptions {
             sh_degree: output::written_degree(args.content.sh, count, degree),
             min_opacity: args.content.min_opacity,
@@ -115,7 +117,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         .steps("rendering", views.len(), |bar| job.render(&mut renderer, &result, &views, bar))?;
     let bounds = result.depth_range();
     let near_far = NearFar::new(bounds.near, bounds.far);
-    output::write_cameras(&args.out, &scored, plan.scene.units, near_far)?;
+    output::write_cameras(&args.out, &scored, &plan.scene, near_far)?;
     let video = video::finish(job.video.take(), &args.motion, answer)?;
     let inputs = progress.stage("inputs", |_| input_report(&result, &options))?;
     Done { model, result, options, scored, inputs, files, video }
@@ -135,7 +137,7 @@ fn input_report(result: &Reconstruction, options: &RasterOptions) -> Result<Inpu
     let (mut scores, mut coverage) = (Vec::new(), 0.0);
     for input in result.inputs() {
         let picture = subsplat::scene::render(result.splats(), &input.target_camera, options);
-        scores.push(Score::of(&picture.rgb, &input.target)?);
+        scores.push(Score::of_kept(&picture.rgb, &input.target, input.target_mask.as_ref())?);
         let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
         coverage += alpha / (picture.alpha.len() * result.inputs().len()) as f64;
     }
@@ -342,10 +344,15 @@ pub fn raster_options(
             LowpassArg::Input => LowpassRef::Input,
         };
     }
-    let colour = Rgb::mean_colour(result.inputs().iter().map(|c| &c.input));
+    let colour = Cropped::mean_colour(result.inputs());
     let near = result.depth_range().near;
     let ratio = result.inputs().first().map_or(1.0, Cropped::ratio);
     let mut options = config.raster_options(ratio, near, colour);
+    let own = result.raster_options();
+    if own.convention == options.convention {
+        // A scene in kilometres has a nearer plane.
+        options.near = own.near;
+    }
     options.background = args.background.unwrap_or(options.background);
     options
 }

@@ -103,7 +103,8 @@ fn broken_files() {
         ("check cut --context 0,2", "view2.png"),
         ("info poseless", "cameras.json"),
         ("run sizes --context 0,2", "128x128"),
-        ("run nan --context 0,2", "cameras.json"),
+        // The first frame is left out, so there are two.
+        ("run nan --context 0,2", "--context: expected a number below 2"),
         ("info unclosed", "cameras.json:"),
         ("render scene.ply", "scene.ply"),
         ("info scene.ply", "scene.ply"),
@@ -123,17 +124,21 @@ fn cameras_of_a_finished_scene() {
     let listed = std::fs::read_to_string(at("scene/cameras.json")).unwrap();
     let mut json: serde_json::Value = serde_json::from_str(&listed).unwrap();
     json["frames"][1]["file"] = "images/nowhere.png".into();
-    json["frames"][1]["fx"] = 0.0.into();
+    for frame in json["frames"].as_array_mut().unwrap() {
+        frame["fx"] = 0.0.into();
+    }
     std::fs::write(at("scene/cameras.json"), json.to_string()).unwrap();
     std::fs::write(at("list.json"), json.to_string()).unwrap();
     std::fs::write(at("cut.json"), &listed[..listed.len() / 2]).unwrap();
-    json["frames"][1]["fx"] = 9.0.into();
+    for frame in json["frames"].as_array_mut().unwrap() {
+        frame["fx"] = 9.0.into();
+    }
     json["frames"][1]["width"] = 32768.into();
     json["frames"][1]["height"] = 32768.into();
     std::fs::write(at("huge.json"), json.to_string()).unwrap();
     let mut rows: Vec<Row> = vec![
-        ("render one.ply --cameras scene", "cameras.json frame 1: expected a camera focal length"),
-        ("render one.ply --cameras list.json", "list.json frame 1"),
+        ("render one.ply --cameras scene", "cameras.json frame 0: expected a camera focal length"),
+        ("render one.ply --cameras list.json", "list.json frame 0"),
         ("render one.ply --cameras cut.json", "cut.json:"),
     ];
     // 32768 x 32768 pixels of 30 bytes; some machines have that.

@@ -518,7 +518,12 @@ fn depth_pictures_do_not_overwrite_colour() {
     let k = Intrinsics::from_fov_x(1.0, 32, 32);
     let camera = Camera::new(k, glam::Mat4::IDENTITY).unwrap();
     let cameras = ["a.png", "a_depth.png", "depth/a.png"].map(|n| named(n.to_owned(), camera));
-    let content = CameraFile { cameras: cameras.to_vec(), units: Units::Unknown, near_far: None };
+    let content = CameraFile {
+        cameras: cameras.to_vec(),
+        units: Units::Unknown,
+        near_far: None,
+        ..Default::default()
+    };
     save_cameras_json(at("cameras.json"), &content).unwrap();
     let report = done(&call_in(place.path(), "--json render one.ply --depth -o out"));
     let views = report["views"].as_array().unwrap();

@@ -128,6 +128,44 @@ fn export_writes_every_format() {
     );
 }
 
+/// What was left out, applied or not read is said by each command that loads a scene file.
+#[test]
+fn notes_on_a_scene_file_are_warnings() {
+    let place = workplace();
+    let mut text = "ply\nformat ascii 1.0\nelement vertex 4\n".to_owned();
+    let names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 \
+         filter_3D label";
+    for name in names.split_whitespace() {
+        text += &format!("property float {name}\n");
+    }
+    text += "end_header\n0 0 3 1 0 0 2 -1 -1 -1 1 0 0 0 0.1 5\n";
+    text += &"0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 0\n".repeat(2);
+    text += "nan 0 3 1 0 0 2 -1 -1 -1 1 0 0 0 0.1 5\n";
+    std::fs::write(place.path().join("foreign.ply"), text).unwrap();
+    for command in ["info foreign.ply", "render foreign.ply -o view", "export foreign.ply -o a.ply"]
+    {
+        let called = call_in(place.path(), command);
+        assert_eq!(called.code, 0, "{}", called.stderr);
+        let all = called.stdout + &called.stderr;
+        for note in [
+            "warning: the property filter_3D",
+            "warning: vertex properties that are not read: label\n",
+            "warning: left out: 2 of 4 splats, whose rotation is 0 0 0 0",
+            "warning: left out: 1 of 4 splats, which hold numbers that are NaN or infinite",
+        ] {
+            assert_eq!(all.matches(note).count(), 1, "{command}: {note}\n{all}");
+        }
+    }
+    let info = call_in(place.path(), "--json info foreign.ply").json();
+    assert_eq!(info["splats"]["notes"].as_array().unwrap().len(), 4);
+    // The copy holds the result, and there is nothing left to say.
+    let copy = call_in(place.path(), "--json info a.ply").json();
+    assert_eq!(
+        (&copy["splats"]["count"], &copy["splats"]["notes"]),
+        (&1.into(), &[""; 0][..].into())
+    );
+}
+
 #[test]
 fn export_merges_gaussians_to_half_and_a_quarter() {
     let place = workplace();

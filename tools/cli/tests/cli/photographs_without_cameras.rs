@@ -111,7 +111,7 @@ fn photographs_that_determine_no_cameras_are_refused_with_exit_code_3() {
         ("poses one", "at least 2 photographs, got 1"),
         ("poses photos/input_0.png", "got one photograph"),
         ("run one", "at least 2 photographs, got 1"),
-        ("poses photos missing.png", "photos"),
+        ("poses photos missing.png", "missing.png"),
         ("poses photos --intrinsics 1,2", "--intrinsics"),
     ] {
         let called = call_in(place.path(), arguments);

@@ -121,16 +121,18 @@ impl Smaller {
 
 /// `c` with a target of `ratio` times the input's sides.
 fn reduced(c: &Cropped, ratio: f32) -> Result<Cropped> {
-    let (target, target_camera) = if ratio == 1.0 {
-        (c.input.clone(), c.input_camera)
+    let (target, target_camera, target_mask) = if ratio == 1.0 {
+        (c.input.clone(), c.input_camera, c.input_mask.clone())
     } else {
         let side = |side: usize| (side as f32 * ratio).round() as usize;
-        c.resized(Size::new(side(c.input.width), side(c.input.height)))?
+        let size = Size::new(side(c.input.width), side(c.input.height));
+        let (target, target_camera) = c.resized(size)?;
+        (target, target_camera, c.resized_mask(size))
     };
     let size = |p: &Rgb| Vec2::new(p.width as f32, p.height as f32);
     let scale = c.window.scale * (size(&c.target) / size(&target));
     let window = PhotoWindow { scale, ..c.window };
-    Ok(Cropped { target, target_camera, window, ..c.clone() })
+    Ok(Cropped { target, target_camera, target_mask, window, ..c.clone() })
 }
 
 impl Set {
@@ -180,7 +182,7 @@ impl<'a> PictureMaker<'a> {
         Ok(Self {
             upscale: options.upscale,
             bounds,
-            colour: Rgb::mean_colour(crops.inputs.iter().map(|c| &c.input)),
+            colour: Cropped::mean_colour(&crops.inputs),
             network,
             density: options.density,
             refine: options.refine,

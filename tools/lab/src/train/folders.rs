@@ -29,7 +29,7 @@ pub fn write_scene(example: &Example, place: &Path) -> Result<()> {
     let context: Vec<usize> = (0..contexts).collect();
     let target: Vec<usize> = (contexts..cameras.len()).collect();
     let near_far = Some(example.near_far);
-    let file = CameraFile { cameras, units: Default::default(), near_far };
+    let file = CameraFile { cameras, units: Default::default(), near_far, ..Default::default() };
     save_cameras_json(place.join("cameras.json"), &file)?;
     let size = example.context.first().map_or((0, 0), |v| (v.image.width, v.image.height));
     let tests = json!([{ "context": context, "target": target }]);

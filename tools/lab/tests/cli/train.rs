@@ -344,8 +344,12 @@ fn terms_that_are_not_measured_are_not_numbers() {
 #[test]
 fn photographs_without_targets_are_refused() {
     let (made, cameras) = made_up::made_up(3);
-    let content =
-        CameraFile { cameras, units: Units::Unknown, near_far: Some(NearFar::new(1.0, 9.0)) };
+    let content = CameraFile {
+        cameras,
+        units: Units::Unknown,
+        near_far: Some(NearFar::new(1.0, 9.0)),
+        ..Default::default()
+    };
     save_cameras_json(made.path().join("cameras.json"), &content).unwrap();
     let refused = |tests: &str| {
         let file = made.path().join("protocol.json");

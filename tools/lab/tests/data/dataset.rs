@@ -174,8 +174,11 @@ fn scene_folder(folder: &Path, frames: usize, units: Units, near_far: Option<Nea
     std::fs::create_dir_all(folder).unwrap();
     let (made, cameras) = made_up::made_up(frames);
     std::fs::rename(made.path().join("images"), folder.join("images")).unwrap();
-    save_cameras_json(folder.join("cameras.json"), &CameraFile { cameras, units, near_far })
-        .unwrap();
+    save_cameras_json(
+        folder.join("cameras.json"),
+        &CameraFile { cameras, units, near_far, ..Default::default() },
+    )
+    .unwrap();
 }
 
 #[test]

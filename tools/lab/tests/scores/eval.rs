@@ -482,7 +482,8 @@ fn a_scene_without_a_protocol_gets_a_case() {
         c.camera = Camera::new(cameras_intrinsics(), pose).unwrap();
     }
     let near_far = Some(NearFar::new(1.0, 4.0));
-    let content = CameraFile { cameras, units: Units::RealEstate10k, near_far };
+    let content =
+        CameraFile { cameras, units: Units::RealEstate10k, near_far, ..Default::default() };
     save_cameras_json(folder.path().join("cameras.json"), &content).unwrap();
     let data = Benchmark::open(folder.path(), None).unwrap();
     let views = &data.cases()[0].views;

@@ -189,9 +189,7 @@ fn with_cameras(
     let found = estimate_cameras(photographs, &EstimateOptions::default())
         .map_err(|error| error.to_string())?;
     let estimate = &found.estimate;
-    warnings.extend(
-        estimate.left_out.iter().map(|l| format!("{} is left out: {}", names[l.photo], l.reason)),
-    );
+    warnings.extend(estimate.left_out_sentences(|photo| names[photo].clone()));
     warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
     Ok((found.photos, warnings))
 }

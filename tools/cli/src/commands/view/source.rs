@@ -12,10 +12,10 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
-use subsplat::files::{SplatFormat, load_with_comments};
+use subsplat::files::SplatFormat;
 use subsplat::finish::PhaseRun;
 use subsplat::scene::navigation::{Start, up_of};
-use subsplat::scene::render::camera_of_comments;
+use subsplat::scene::render::{camera_of_comments, origin_of_comments};
 use subsplat::scene::splats::Splats;
 use subsplat::{
     Check, Options, Photo, Reconstruction, Reconstructor, Refine, Renderer, Stage, TargetSize,
@@ -92,12 +92,14 @@ fn is_splats(path: &Path) -> Result<bool> {
 }
 
 fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Source> {
-    let (splats, comments) = progress.stage("scene", |_| load_with_comments(path))?;
-    let options = render::options(&args.rendering(), args.source.near, SH_DEGREE, &comments)?;
+    let (splats, comments) = progress.stage("scene", |_| render::load(path))?;
+    let options =
+        render::options(&args.rendering(), args.source.near, SH_DEGREE, &splats, &comments)?;
     let beside = path.parent().unwrap_or(Path::new("")).join("cameras.json");
+    let origin = origin_of_comments(&comments);
     let cameras = match &args.cameras {
-        Some(source) => render::read_cameras(source)?,
-        None if beside.is_file() => render::read_cameras(&beside)?,
+        Some(source) => render::read_cameras(source, origin)?,
+        None if beside.is_file() => render::read_cameras(&beside, origin)?,
         None => {
             let own = camera_of_comments(&comments);
             vec![(String::new(), own.map_or_else(|| whole::camera(&splats, &comments), Ok)?)]

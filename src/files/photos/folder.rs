@@ -1,0 +1,160 @@
+//! The photographs of a folder, by content: a picture under another extension is one, and what cannot be
+//! read is named with the reason.
+
+use super::heic;
+use super::photograph::probe_photograph;
+use crate::files::Error;
+use crate::files::poses::assemble::{files, list_images};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Extensions of pictures beside the usual ones; some of the formats are not read.
+const OTHER_EXTENSIONS: [&str; 15] = [
+    "avif", "jxl", "gif", "exr", "hdr", "dng", "cr2", "cr3", "nef", "arw", "raf", "orf", "rw2",
+    "mpo", "insp",
+];
+/// Extensions of videos.
+const VIDEOS: [&str; 6] = ["mov", "mp4", "m4v", "avi", "mkv", "webm"];
+/// Names of a line; the others are counted.
+const NAMES: usize = 3;
+/// Bytes that decide what a file is.
+const START: usize = 32;
+
+/// Photographs of a folder.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct FolderPhotographs {
+    /// By name, with numbers in numeric order.
+    pub photographs: Vec<PathBuf>,
+    /// Names of pictures that are left out, each with the reason.
+    pub left_out: Vec<[String; 2]>,
+    /// Files `._*`, which macOS writes beside others and which are no pictures.
+    pub companions: usize,
+}
+
+impl FolderPhotographs {
+    /// Lines about what is left out.
+    pub fn notes(&self) -> Vec<String> {
+        let mut notes = Vec::new();
+        let mut reasons: Vec<&str> = Vec::new();
+        for [_, reason] in &self.left_out {
+            if !reasons.contains(&reason.as_str()) {
+                reasons.push(reason);
+            }
+        }
+        for reason in reasons {
+            let of_reason = self.left_out.iter().filter(|[_, other]| other == reason);
+            let names: Vec<&str> = of_reason.map(|[name, _]| name.as_str()).collect();
+            let (few, more) = names.split_at(names.len().min(NAMES));
+            let more = match more.len() {
+                0 => String::new(),
+                n => format!(" and {n} more"),
+            };
+            notes.push(format!("left out: {}{more}: {reason}", few.join(", ")));
+        }
+        if self.companions > 0 {
+            notes.push(format!("{} files ._* of macOS are no pictures", self.companions));
+        }
+        notes
+    }
+}
+
+/// The photographs of a folder; without any, those of its folder `images`.
+pub fn find_photographs(folder: impl AsRef<Path>) -> FolderPhotographs {
+    let folder = folder.as_ref();
+    let own = in_folder(folder);
+    if own.photographs.is_empty() && own.left_out.is_empty() {
+        return in_folder(&folder.join("images"));
+    }
+    own
+}
+
+fn in_folder(folder: &Path) -> FolderPhotographs {
+    let mut found = FolderPhotographs { companions: companions(folder), ..Default::default() };
+    let listed = list_images(folder);
+    for path in files(folder) {
+        if !listed.contains(&path) && !is_picture(&path) {
+            continue;
+        }
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        let reason = if VIDEOS.contains(&extension.as_str()) {
+            "a video: save frames of it as pictures".to_owned()
+        } else {
+            match probe_photograph(&path) {
+                Ok(_) => {
+                    found.photographs.push(path);
+                    continue;
+                }
+                Err(Error::Format { got, .. }) => got,
+                Err(Error::Io { source, .. }) => source.to_string(),
+            }
+        };
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        found.left_out.push([name, reason]);
+    }
+    found
+}
+
+/// Returns whether a file without a usual extension is, or is called, a picture or a video.
+fn is_picture(path: &Path) -> bool {
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    if OTHER_EXTENSIONS.contains(&&*extension) || VIDEOS.contains(&&*extension) {
+        return true;
+    }
+    let mut start = Vec::with_capacity(START);
+    let read =
+        std::fs::File::open(path).and_then(|file| file.take(START as u64).read_to_end(&mut start));
+    read.is_ok() && (image::guess_format(&start).is_ok() || heic::brand(&start).is_some())
+}
+
+/// Number of files `._*`.
+fn companions(folder: &Path) -> usize {
+    let Ok(entries) = std::fs::read_dir(folder) else { return 0 };
+    let names = entries.filter_map(|entry| Some(entry.ok()?.file_name()));
+    names.filter(|name| name.to_string_lossy().starts_with("._")).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::files::photos::image::save_png;
+    use crate::scene::pictures::Rgb;
+
+    #[test]
+    fn pictures_are_found_by_content_and_others_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let picture = Rgb::black(4, 3);
+        for name in ["b10.png", "b9.jfif", "c"] {
+            save_png(path("x.png"), &picture).unwrap();
+            std::fs::rename(path("x.png"), path(name)).unwrap();
+        }
+        for (name, bytes) in [
+            ("._b10.png", &b"\0\x05\x16\x07"[..]),
+            ("empty.jpg", b""),
+            ("clip.mov", b"nothing"),
+            ("notes.txt", b"text"),
+            (".hidden.png", b"x"),
+        ] {
+            std::fs::write(path(name), bytes).unwrap();
+        }
+        let found = find_photographs(folder.path());
+        assert_eq!(found.photographs, ["b9.jfif", "b10.png", "c"].map(path));
+        assert_eq!(found.companions, 1);
+        assert_eq!(found.left_out.len(), 2, "{:?}", found.left_out);
+        assert_eq!(found.left_out[0][0], "clip.mov");
+        assert_eq!(found.left_out[1], ["empty.jpg", "an empty file"]);
+        let notes = found.notes();
+        assert!(notes.len() == 3 && notes[2].contains("._*"), "{notes:?}");
+        let many = FolderPhotographs {
+            left_out: ["a", "b", "c", "d"].map(|n| [n.to_owned(), "no".to_owned()]).to_vec(),
+            ..Default::default()
+        };
+        assert_eq!(many.notes(), ["left out: a, b, c and 1 more: no"]);
+        // A folder of nothing but `images`.
+        std::fs::create_dir(path("inner")).unwrap();
+        std::fs::rename(path("c"), path("inner/c")).unwrap();
+        std::fs::create_dir(path("outer")).unwrap();
+        std::fs::rename(path("inner"), path("outer/images")).unwrap();
+        assert_eq!(find_photographs(path("outer")).photographs, [path("outer/images/c")]);
+    }
+}

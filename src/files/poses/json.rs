@@ -1,0 +1,94 @@
+//! JSON as programs write it: with a byte order mark, and with `NaN` and `Infinity`, which JSON lacks.
+
+use super::super::{Error, Result};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Deserializer};
+use std::borrow::Cow;
+use std::path::Path;
+
+/// UTF-8's byte order mark.
+const MARK: &[u8] = b"\xEF\xBB\xBF";
+/// Numbers that JSON lacks, as Python and C++ write them.
+const NOT_NUMBERS: [&str; 6] = ["-Infinity", "Infinity", "-inf", "inf", "NaN", "nan"];
+
+/// Reads `bytes` of `path`, which should be `expected`.
+///
+/// # Errors
+/// Malformed JSON, or JSON of another layout; the error has line and column.
+pub(super) fn parse<T: DeserializeOwned>(path: &Path, bytes: &[u8], expected: &str) -> Result<T> {
+    serde_json::from_slice(&clean(bytes)).map_err(|e| error(path, expected, &e))
+}
+
+/// Any JSON.
+pub(super) fn value(bytes: &[u8]) -> serde_json::Result<serde_json::Value> {
+    serde_json::from_slice(&clean(bytes))
+}
+
+/// Deserializes rows of numbers; what is no number in JSON is not a number.
+pub(super) fn rows<'de, D: Deserializer<'de>>(
+    from: D,
+) -> std::result::Result<Vec<Vec<f64>>, D::Error> {
+    let rows = Vec::<Vec<Option<f64>>>::deserialize(from)?;
+    let numbers = |row: Vec<Option<f64>>| row.into_iter().map(|v| v.unwrap_or(f64::NAN)).collect();
+    Ok(rows.into_iter().map(numbers).collect())
+}
+
+/// Makes an error of a JSON error, with its line and column; serde's message has the
+/// expected and the found value.
+pub(super) fn error(path: &Path, expected: &str, error: &serde_json::Error) -> Error {
+    let text = error.to_string();
+    // serde_json appends the place, which `at` holds.
+    let got = text.split(" at line ").next().unwrap_or(&text);
+    let got = got
+        .replace("invalid type: null, expected f64", "a number that is NaN, infinite or missing");
+    let place = format!(":{}:{}", error.line(), error.column());
+    let at = if error.line() > 0 { place } else { String::new() };
+    Error::format(path, expected, got).at(at)
+}
+
+/// `bytes` without a byte order mark, and with `null` for numbers that JSON lacks.
+fn clean(bytes: &[u8]) -> Cow<'_, [u8]> {
+    let bytes = bytes.strip_prefix(MARK).unwrap_or(bytes);
+    let mut out = Vec::new();
+    let (mut in_string, mut at, mut copied) = (false, 0, 0);
+    while let Some(byte) = bytes.get(at) {
+        let rest = &bytes[at..];
+        let word = NOT_NUMBERS.iter().find(|word| rest.starts_with(word.as_bytes()));
+        at += match (byte, word) {
+            (b'\\', _) if in_string => 2,
+            (b'"', _) => {
+                in_string = !in_string;
+                1
+            }
+            (_, Some(word)) if !in_string => {
+                out.extend_from_slice(&bytes[copied..at]);
+                out.extend_from_slice(b"null");
+                copied = at + word.len();
+                word.len()
+            }
+            _ => 1,
+        };
+    }
+    if copied == 0 {
+        return Cow::Borrowed(bytes);
+    }
+    out.extend_from_slice(&bytes[copied..]);
+    Cow::Owned(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_that_json_lacks_are_null_outside_strings() {
+        let text = b"\xEF\xBB\xBF{\"NaN \\\" inf\": [NaN, -Infinity, 1.5, nan], \"b\": Infinity}";
+        let expected = b"{\"NaN \\\" inf\": [null, null, 1.5, null], \"b\": null}";
+        assert_eq!(&*clean(text), expected);
+        assert!(matches!(clean(b"{\"a\": 1}"), Cow::Borrowed(_)));
+        let value: Vec<Vec<f64>> = rows(value(b"[[1, NaN]]").unwrap()).unwrap();
+        assert!(value[0][0] == 1.0 && value[0][1].is_nan());
+        let e = parse::<f64>(Path::new("a.json"), b" \nNaN", "a number").unwrap_err().to_string();
+        assert!(e.starts_with("a.json:2:") && e.contains("NaN"), "{e}");
+    }
+}
