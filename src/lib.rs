@@ -104,6 +104,7 @@ pub use files::{
     save_splats,
 };
 pub use finish::{FinishError, FitOptions, TargetView};
+pub use scene::mask::Mask;
 pub use scene::navigation::Bounds;
 pub use scene::pictures::{Depth, Rgb};
 pub use scene::render::{Picture, Renderer, render};

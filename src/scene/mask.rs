@@ -241,7 +241,8 @@ fn between(picture: &Rgb, x: usize, y: usize) -> [u8; 3] {
     // The centre of pixel i lies a quarter of a coarser pixel from the centre of pixel i / 2.
     let neighbours = |i: usize, end: usize| {
         let own = (i / 2).min(end - 1);
-        let other = if i % 2 == 0 { own.saturating_sub(1) } else { (own + 1).min(end - 1) };
+        let other =
+            if i.is_multiple_of(2) { own.saturating_sub(1) } else { (own + 1).min(end - 1) };
         [(own, 3), (other, 1)]
     };
     let (columns, rows) = (neighbours(x, picture.width), neighbours(y, picture.height));

@@ -198,8 +198,8 @@ fn masked_pixels_match_nothing() {
         cameras[1].project(cameras[0].intrinsics().unproject(px) * truth[0][i])
     };
     let mut counts = [0; 2];
-    for i in 0..SIZE * SIZE {
-        assert!(!(masked[i] && found[1].certain[i]), "{i}");
+    for (i, masked) in masked.iter().enumerate() {
+        assert!(!(*masked && found[1].certain[i]), "{i}");
         if there(i).is_some_and(|p| inside(p.x, p.y)) {
             counts[0] += 1;
             counts[1] += usize::from(found[0].certain[i]);

@@ -2,7 +2,7 @@
 //! list that a folder has is read, of several COLMAP models the largest; a line names what is not read.
 //!
 //! 1. `cameras.json`, `transforms.json`, `transforms_train.json` (NeRF's synthetic scenes)
-//! 2. COLMAP models in [`MODEL_FOLDERS`] and their numbered folders
+//! 2. COLMAP models in `sparse`, `colmap/sparse`, the folder itself and `dense`, and in their numbered folders
 //! 3. a RealEstate10K txt
 //! 4. `poses.txt` with `K.txt`
 

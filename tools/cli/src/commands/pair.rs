@@ -62,7 +62,7 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
 /// # Errors
 /// One photograph; a file among several that is no picture; pictures that `subsplat run` rendered.
 pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
-    for folder in input.iter().filter(|path| is_own_output(path)) {
+    if let Some(folder) = input.iter().find(|path| is_own_output(path)) {
         bail!(
             "{}: expected photographs, got pictures that subsplat rendered; give the photographs, or open \
              the scene with `subsplat view {}`",
