@@ -288,7 +288,7 @@ mod tests {
     fn masked(photos: Vec<Photo>) -> Vec<Photo> {
         let side = SIDES[0];
         let with = |(i, photo): (usize, Photo)| {
-            // What is masked would make white Gaussians.
+            // Masked pixels would make white Gaussians.
             let mut image = photo.image().clone();
             let kept: Vec<bool> =
                 (0..side * side).map(|p| is_kept(i, p % side / 2, p / side / 2)).collect();

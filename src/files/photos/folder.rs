@@ -4,7 +4,7 @@
 use super::heic;
 use super::photograph::probe_photograph;
 use crate::files::Error;
-use crate::files::poses::assemble::{files, list_images};
+use crate::files::poses::assemble::{files, has_extension};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -70,11 +70,7 @@ pub fn find_photographs(folder: impl AsRef<Path>) -> FolderPhotographs {
 
 fn in_folder(folder: &Path) -> FolderPhotographs {
     let mut found = FolderPhotographs { companions: companions(folder), ..Default::default() };
-    let listed = list_images(folder);
-    for path in files(folder) {
-        if !listed.contains(&path) && !is_picture(&path) {
-            continue;
-        }
+    for path in files(folder).into_iter().filter(|path| is_picture(path)) {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
         let reason = if VIDEOS.contains(&extension.as_str()) {
             "a video: save frames of it as pictures".to_owned()
@@ -94,10 +90,13 @@ fn in_folder(folder: &Path) -> FolderPhotographs {
     found
 }
 
-/// Returns whether a file without a usual extension is, or is called, a picture or a video.
+/// Returns whether a file is, or is called, a picture or a video.
 fn is_picture(path: &Path) -> bool {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    if OTHER_EXTENSIONS.contains(&&*extension) || VIDEOS.contains(&&*extension) {
+    if has_extension(path)
+        || OTHER_EXTENSIONS.contains(&&*extension)
+        || VIDEOS.contains(&&*extension)
+    {
         return true;
     }
     let mut start = Vec::with_capacity(START);

@@ -143,7 +143,8 @@ fn is_extension(extension: &str) -> bool {
     EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(extension))
 }
 
-fn has_extension(path: &Path) -> bool {
+/// Returns whether a file has the extension of a picture.
+pub(in crate::files) fn has_extension(path: &Path) -> bool {
     is_extension(&path.extension().unwrap_or_default().to_string_lossy())
 }
 
@@ -194,16 +195,20 @@ pub(in crate::files) fn list_images(folder: &Path) -> Vec<PathBuf> {
 
 /// Lists the files of a folder without hidden ones, sorted by name with numbers in numeric order.
 pub(in crate::files) fn files(folder: &Path) -> Vec<PathBuf> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
-    let hidden =
-        |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
-    let mut files: Vec<PathBuf> = entries
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|path| path.is_file() && !hidden(path))
-        .collect();
+    let mut files = entries(folder);
+    files.retain(|path| path.is_file());
     // The path decides between `01.png` and `1.png`.
     files.sort_by_cached_key(|p| (numeric_key(p), p.clone()));
     files
+}
+
+/// Lists what is in a folder, without hidden files and folders; empty if there is no such folder.
+pub(super) fn entries(folder: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let hidden =
+        |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
+    let paths = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    paths.filter(|path| !hidden(path)).collect()
 }
 
 /// A pose after [`orthonormal`].
@@ -385,7 +390,7 @@ pub(super) fn assemble(
     })
 }
 
-/// Whether a scene's pictures are needed.
+/// Need of a scene's pictures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Pictures {
     /// Frames without a picture are left out.

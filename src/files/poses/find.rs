@@ -6,6 +6,7 @@
 //! 3. a RealEstate10K txt
 //! 4. `poses.txt` with `K.txt`
 
+use super::assemble::entries;
 use super::{colmap, re10k};
 use crate::files::photos::photograph::list_photographs;
 use crate::files::{Result, read};
@@ -53,6 +54,15 @@ pub(super) enum PoseFile {
 }
 
 impl PoseFile {
+    /// Number of cameras, 0 where it is not known. Reads the file.
+    fn cameras(&self) -> usize {
+        match self {
+            Self::Json(path) => cameras_of_json(path, true).unwrap_or(0),
+            Self::Colmap(folder) => colmap::count_images(folder),
+            Self::Re10k(_) | Self::Matrices(_) => 0,
+        }
+    }
+
     fn path(&self) -> &Path {
         match self {
             Self::Json(path) | Self::Colmap(path) | Self::Re10k(path) | Self::Matrices(path) => {
@@ -62,11 +72,10 @@ impl PoseFile {
     }
 }
 
-/// A pose file with its number of cameras.
+/// A pose file that can be read.
 #[derive(Clone, Debug)]
 struct Candidate {
     file: PoseFile,
-    cameras: usize,
     part: Part,
 }
 
@@ -104,7 +113,9 @@ pub(super) fn find(folder: &Path) -> Result<Option<Found>> {
         below.extend(candidates(folder)?);
     }
     // The largest, the first of several.
-    below.sort_by_key(|candidate| std::cmp::Reverse(candidate.cameras));
+    if below.len() > 1 {
+        below.sort_by_cached_key(|candidate| std::cmp::Reverse(candidate.file.cameras()));
+    }
     let mut below = below.into_iter();
     let Some(first) = below.next() else { return Ok(None) };
     let mut found = chosen(folder, first, below.collect());
@@ -161,48 +172,36 @@ pub fn folders(folder: impl AsRef<Path>) -> Vec<PathBuf> {
 }
 
 fn folders_in(folder: &Path) -> Vec<PathBuf> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
-    let hidden =
-        |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
-    let mut all: Vec<PathBuf> = entries
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|path| path.is_dir() && !hidden(path))
-        .collect();
+    let mut all = entries(folder);
+    all.retain(|path| path.is_dir());
     all.sort();
     all.truncate(FOLDERS_MAX);
     all
 }
 
-/// The pose files of a folder, the one to read first.
+/// The pose files of a folder, the one to read first. Files are read where their content decides alone.
 fn candidates(folder: &Path) -> Result<Vec<Candidate>> {
     let mut all = Vec::new();
+    let mut add = |file: PoseFile, part: Part| all.push(Candidate { file, part });
     for file in JSON_FILES {
         let path = folder.join(file);
+        // A malformed file of the first two names is an error of its reader.
         let whole = file == "cameras.json" || file == "transforms.json";
-        if path.is_file()
-            && let Some(cameras) = cameras_of_json(&path, whole)
-        {
-            let part = if whole { Part::Whole(file) } else { Part::Transforms };
-            all.push(Candidate { file: PoseFile::Json(path), cameras, part });
+        if path.is_file() && (whole || cameras_of_json(&path, false).is_some()) {
+            add(PoseFile::Json(path), if whole { Part::Whole(file) } else { Part::Transforms });
         }
     }
-    let mut models: Vec<Candidate> = MODEL_FOLDERS
-        .iter()
-        .flat_map(|base| models(&folder.join(base), base.is_empty()))
-        .map(|path| {
-            let cameras = colmap::count_images(&path);
-            Candidate { file: PoseFile::Colmap(path), cameras, part: Part::Colmap }
-        })
-        .collect();
-    models.sort_by_key(|model| std::cmp::Reverse(model.cameras));
-    all.append(&mut models);
+    let mut models: Vec<PathBuf> =
+        MODEL_FOLDERS.iter().flat_map(|base| models(&folder.join(base), base.is_empty())).collect();
+    if models.len() > 1 {
+        models.sort_by_cached_key(|model| std::cmp::Reverse(colmap::count_images(model)));
+    }
+    models.into_iter().for_each(|model| add(PoseFile::Colmap(model), Part::Colmap));
     if let Some(path) = re10k::find(folder)? {
-        let file = PoseFile::Re10k(path);
-        all.push(Candidate { file, cameras: 0, part: Part::Whole("txt") });
+        add(PoseFile::Re10k(path), Part::Whole("txt"));
     }
     if folder.join("poses.txt").is_file() {
-        let file = PoseFile::Matrices(folder.to_owned());
-        all.push(Candidate { file, cameras: 0, part: Part::Whole("poses.txt") });
+        add(PoseFile::Matrices(folder.to_owned()), Part::Whole("poses.txt"));
     }
     Ok(all)
 }
@@ -221,23 +220,18 @@ fn models(base: &Path, alone: bool) -> Vec<PathBuf> {
     all.filter(|path| colmap::is_model(path)).collect()
 }
 
-/// Number of cameras of a JSON file. A file of the first two names (`whole`) is read in any case, so that a
-/// malformed one is an error; the others only where they have frames.
-fn cameras_of_json(path: &Path, whole: bool) -> Option<usize> {
-    let bytes = read(path).unwrap_or_default();
-    let value = super::json::value(&bytes).unwrap_or_default();
+/// Number of cameras of a JSON file: of an object with frames, or of a list where `lists`.
+fn cameras_of_json(path: &Path, lists: bool) -> Option<usize> {
+    let value = super::json::value(&read(path).ok()?).ok()?;
     let frames = value.get("frames").and_then(|frames| frames.as_array());
-    match frames.or(value.as_array().filter(|_| whole)) {
-        Some(frames) => Some(frames.len()),
-        None => whole.then_some(0),
-    }
+    frames.or(value.as_array().filter(|_| lists)).map(Vec::len)
 }
 
 /// The candidate `first`, and a line that names the `others`.
 fn chosen(folder: &Path, first: Candidate, others: Vec<Candidate>) -> Found {
     let named = |other: Candidate| {
         let name = name(folder, other.file.path());
-        match other.cameras {
+        match other.file.cameras() {
             0 => name,
             cameras => format!("{name} ({cameras} cameras)"),
         }

@@ -425,7 +425,7 @@ pub(super) struct Decoded {
     pub flavour: String,
     /// Comments of the file.
     pub comments: Vec<String>,
-    /// What reading applied or did not read, a line each.
+    /// Lines about what reading applied or did not read.
     pub notes: Vec<String>,
     /// Gaussians that were left out because a number is NaN or infinite.
     pub non_finite: usize,

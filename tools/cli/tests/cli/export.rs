@@ -128,7 +128,7 @@ fn export_writes_every_format() {
     );
 }
 
-/// What was left out, applied or not read is said by each command that loads a scene file.
+/// Each command that loads a scene file says what was left out, applied or not read.
 #[test]
 fn notes_on_a_scene_file_are_warnings() {
     let place = workplace();
