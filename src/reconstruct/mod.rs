@@ -38,6 +38,7 @@
 //! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
 //! the caller can then free large photographs before the network runs.
 
+mod assessment;
 mod children;
 mod coarse_to_fine;
 mod density;
@@ -60,6 +61,7 @@ mod unit;
 mod warning;
 
 pub use crate::network::model::Backend;
+pub use assessment::{Agreement, Assessment};
 pub use density::Density;
 pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};

@@ -1,12 +1,30 @@
 //! Output for the user: progress bars, lines, and the answer of a command.
 
 use anyhow::Context;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
 use std::time::{Duration, Instant};
 use subsplat::reconstruct::StageTime;
+
+/// Time before the first line about a stage where there are no bars, and between two of them.
+const LINES_FIRST: Duration = Duration::from_secs(4);
+const LINES_EVERY: Duration = Duration::from_secs(6);
+
+/// Set by `--quiet`.
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Leaves out bars and lines that are neither warnings nor errors.
+pub fn be_quiet() {
+    QUIET.store(true, Ordering::Relaxed);
+}
+
+fn is_quiet() -> bool {
+    QUIET.load(Ordering::Relaxed)
+}
 
 /// Steps of a bar that shows a fraction.
 const FRACTION_STEPS: u64 = 1000;
@@ -36,6 +54,7 @@ impl Progress {
         work: impl FnOnce(&ProgressBar) -> Result<T, E>,
     ) -> Result<T, E> {
         let bar = ProgressBar::new_spinner();
+        hide_if_quiet(&bar);
         if let Ok(style) = ProgressStyle::with_template("{spinner} {prefix} {msg} [{elapsed}]") {
             bar.set_style(style);
         }
@@ -52,6 +71,7 @@ impl Progress {
         work: impl FnOnce(&ProgressBar) -> Result<T, E>,
     ) -> Result<T, E> {
         let bar = ProgressBar::new(total as u64);
+        hide_if_quiet(&bar);
         let template = "{prefix} {wide_bar} {pos}/{len} [{elapsed} < {eta}]";
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style);
@@ -67,7 +87,8 @@ impl Progress {
         work: impl FnOnce(&ProgressBar) -> Result<T, E>,
     ) -> Result<T, E> {
         let bar = ProgressBar::new(FRACTION_STEPS);
-        let template = "{prefix}: {msg} {wide_bar} {percent} % [{elapsed}]";
+        hide_if_quiet(&bar);
+        let template = "{prefix}: {msg} {wide_bar} {percent} % [{elapsed} < {eta}]";
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style);
         }
@@ -82,7 +103,7 @@ impl Progress {
         work: impl FnOnce(&ProgressBar) -> Result<T, E>,
     ) -> Result<T, E> {
         let start = Instant::now();
-        let result = work(bar);
+        let result = with_lines(bar, work);
         bar.finish_and_clear();
         self.record(name, start.elapsed().as_secs_f64());
         result
@@ -110,6 +131,51 @@ impl Progress {
     }
 }
 
+fn hide_if_quiet(bar: &ProgressBar) {
+    if is_quiet() {
+        bar.set_draw_target(ProgressDrawTarget::hidden());
+    }
+}
+
+/// Runs `work`. Where stderr is no terminal, and so shows no bars, it gets a line about `bar` every few seconds.
+fn with_lines<T>(bar: &ProgressBar, work: impl FnOnce(&ProgressBar) -> T) -> T {
+    if is_quiet() || std::io::stderr().is_terminal() {
+        return work(bar);
+    }
+    std::thread::scope(|scope| {
+        let (end, ended) = mpsc::channel::<()>();
+        let watched = bar.clone();
+        scope.spawn(move || {
+            let mut wait = LINES_FIRST;
+            // The sender is dropped at the end of the work.
+            while ended.recv_timeout(wait) == Err(mpsc::RecvTimeoutError::Timeout) {
+                print_line(state_of(&watched));
+                wait = LINES_EVERY;
+            }
+        });
+        let result = work(bar);
+        drop(end);
+        result
+    })
+}
+
+/// A bar as a line: `reconstructing: refining the splats, 40 %, 12 s, about 18 s left`.
+fn state_of(bar: &ProgressBar) -> String {
+    let seconds = |d: Duration| format!("{} s", d.as_secs());
+    let message = Some(bar.message()).filter(|m| !m.is_empty()).map(|m| format!(": {m}"));
+    let mut line = format!("{}{}", bar.prefix(), message.unwrap_or_default());
+    if let Some(length) = bar.length().filter(|n| *n > 0) {
+        let percent = 100 * bar.position() / length;
+        line = format!("{line}, {percent} %, {}", seconds(bar.elapsed()));
+        if bar.position() > 0 {
+            line = format!("{line}, about {} left", seconds(bar.eta()));
+        }
+    } else {
+        line = format!("{line}, {}", seconds(bar.elapsed()));
+    }
+    line
+}
+
 /// Moves the bar of [`Progress::fraction`] to a state of the library.
 pub fn show_fraction(bar: &ProgressBar, progress: subsplat::Progress) -> ControlFlow<()> {
     bar.set_message(progress.stage.description());
@@ -129,15 +195,21 @@ pub fn peak_memory_bytes() -> Option<u64> {
     Some(kib * 1024)
 }
 
-/// Prints a line on stderr.
+/// Prints a line on stderr, but for `--quiet`.
 pub fn print_line(line: impl std::fmt::Display) {
-    // A closed stderr is no error.
-    let _ = writeln!(std::io::stderr(), "{line}");
+    if !is_quiet() {
+        print(line);
+    }
 }
 
 /// Prints a warning on stderr.
 pub fn print_warning(line: impl std::fmt::Display) {
-    print_line(format!("warning: {line}"));
+    print(format!("warning: {line}"));
+}
+
+fn print(line: impl std::fmt::Display) {
+    // A closed stderr is no error.
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// The answer of a command on stdout: lines, or one JSON object.

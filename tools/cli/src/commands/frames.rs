@@ -80,10 +80,25 @@ pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
 /// Cameras from the first to the last of `through`, evenly in time: positions along a
 /// Catmull-Rom curve, rotations by slerp, focal lengths in proportion.
 pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
+    let last = through.len().saturating_sub(1) as f32;
+    cameras_at(through, (0..frames).map(|i| i as f32 / (frames - 1).max(1) as f32 * last))
+}
+
+/// Cameras on the same way, none of them at a place of `through`.
+pub fn between(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
+    let last = through.len().saturating_sub(1) as f32;
+    let time = |i: usize| {
+        let t = (i as f32 + 0.5) / frames as f32 * last;
+        t.floor() + t.fract().clamp(0.25, 0.75)
+    };
+    cameras_at(through, (0..frames).map(time))
+}
+
+/// Cameras at the times `times` of the way through all of `through`, which has one at each whole number.
+fn cameras_at(through: &[Camera], times: impl Iterator<Item = f32>) -> Result<Vec<Camera>> {
     ensure!(through.len() >= 2, "a path needs at least 2 cameras, got {}", through.len());
     let last = through.len() - 1;
-    let at = |i: usize| {
-        let t = i as f32 / (frames - 1).max(1) as f32 * last as f32;
+    let at = |t: f32| {
         let k = (t.floor() as usize).min(last - 1);
         let f = t - k as f32;
         let p = |i: isize| {
@@ -111,7 +126,7 @@ pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
         intrinsics.cy += f * (b.cy - a.cy);
         Ok(Camera::new(intrinsics, Mat4::from_rotation_translation(rotation, position))?)
     };
-    (0..frames).map(at).collect()
+    times.map(at).collect()
 }
 
 fn catmull_rom(p: [Vec3; 4], t: f32) -> Vec3 {
@@ -243,6 +258,21 @@ mod tests {
             assert!(Camera::new(path[i].intrinsics(), path[i].world_from_camera()).is_ok());
         }
         assert!(interpolate(&through[..1], 5).is_err());
+    }
+
+    #[test]
+    fn views_between_photographs_are_none_of_them() {
+        let through: Vec<Camera> = (0..5).map(|i| camera(i as f32, 0.1 * i as f32)).collect();
+        for count in 2..=5 {
+            let views = between(&through[..count], 3).unwrap();
+            assert_eq!(views.len(), 3);
+            for view in &views {
+                let x = view.position().x;
+                assert!((x - x.round()).abs() > 0.2, "{count} photographs: {x}");
+                assert!(x > 0.0 && x < (count - 1) as f32);
+            }
+        }
+        assert!(between(&through[..1], 3).is_err());
     }
 
     #[test]

@@ -8,6 +8,8 @@ use serde_json::json;
 use std::io::Write;
 use std::path::Path;
 use subsplat::files::{SaveOptions, SaveReport, SplatFormat, encode_splats_with, write_atomic};
+use subsplat::finish::reduce;
+use subsplat::scene::render::Renderer;
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions};
@@ -15,6 +17,10 @@ use subsplat_kernels::layout::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOption
 const TEMPLATE: &str = include_str!("../../../web/scene.html");
 const STYLE: &str = include_str!("../../../web/viewer.css");
 const VIEWER: &str = include_str!("../../../web/viewer.js");
+
+/// Bytes of a Gaussian with one colour in a .spz: fewer than that have not been seen, and a mean.
+const BYTES_LEAST: usize = 5;
+const BYTES_MEAN: usize = 13;
 
 /// A scene to be written.
 pub struct Page<'a> {
@@ -34,13 +40,47 @@ impl Page<'_> {
     /// # Errors
     /// Those of [`encode_splats_with`] for .spz; system errors.
     pub fn write(&self, path: &Path, save: &SaveOptions) -> Result<SaveReport> {
-        let save = SaveOptions { min_opacity: save.min_opacity.max(ALPHA_MIN), ..save.clone() };
-        let (scene, report) = encode_splats_with(SplatFormat::Spz, self.splats, &save, path)?;
+        let (scene, report) = encoded(self.splats, save, path)?;
+        self.write_encoded(path, &scene, report)
+    }
+
+    /// Writes a page of about `most` bytes: of a larger scene one colour for all views, then fewer Gaussians
+    /// ([`reduce`]).
+    ///
+    /// # Errors
+    /// Those of [`Page::write`].
+    pub fn write_within(
+        &self,
+        path: &Path,
+        save: &SaveOptions,
+        most: usize,
+        renderer: &mut Renderer,
+    ) -> Result<SaveReport> {
+        let room = most.saturating_sub(TEMPLATE.len() + STYLE.len() + VIEWER.len()) / 4 * 3;
+        let plain = SaveOptions { sh_degree: Some(0), ..save.clone() };
+        let mut count = room / BYTES_MEAN;
+        // More would take the time of an encoding for nothing.
+        if self.splats.len() <= room / BYTES_LEAST {
+            for save in [save, &plain] {
+                let (scene, report) = encoded(self.splats, save, path)?;
+                if scene.len() <= room {
+                    return self.write_encoded(path, &scene, report);
+                }
+                count = (room as f64 / scene.len() as f64 * report.count as f64) as usize;
+            }
+        }
+        let fewer = reduce(self.splats, self.cameras, self.options, count, renderer);
+        let save = plain;
+        let (scene, report) = encoded(&fewer, &save, path)?;
+        self.write_encoded(path, &scene, report)
+    }
+
+    fn write_encoded(&self, path: &Path, scene: &[u8], report: SaveReport) -> Result<SaveReport> {
         let parts = [
             ("{{title}}", escaped(self.title)),
             ("{{css}}", STYLE.to_owned()),
             ("{{settings}}", self.settings()),
-            ("{{scene}}", base64::encode(&scene)),
+            ("{{scene}}", base64::encode(scene)),
             ("{{js}}", VIEWER.to_owned()),
         ];
         let bytes = write_atomic(path, |file| {
@@ -78,6 +118,12 @@ impl Page<'_> {
     }
 }
 
+/// The .spz of a page. Gaussians that no pixel shows are left out.
+fn encoded(splats: &Splats, save: &SaveOptions, path: &Path) -> Result<(Vec<u8>, SaveReport)> {
+    let save = SaveOptions { min_opacity: save.min_opacity.max(ALPHA_MIN), ..save.clone() };
+    Ok(encode_splats_with(SplatFormat::Spz, splats, &save, path)?)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -96,5 +142,43 @@ mod tests {
         for text in [TEMPLATE, STYLE, VIEWER] {
             assert!(!text.contains("http:") && !text.contains("https:") && !text.contains("src="));
         }
+    }
+
+    #[test]
+    fn a_page_within_a_limit_keeps_what_fits() {
+        use subsplat_kernels::layout::ShBasis;
+        // A surface of 60 by 60 Gaussians with colours of degree 1 that no compression shortens.
+        let mut rows = Vec::new();
+        let mut noise = 1u32;
+        let mut next = || {
+            noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (noise >> 8) as f32 / (1 << 24) as f32
+        };
+        let sh: Vec<f32> = (0..3600 * 12).map(|_| next() - 0.5).collect();
+        for i in 0..3600 {
+            let (x, y) = ((i % 60) as f32 / 60.0, (i / 60) as f32 / 60.0);
+            rows.extend([x, y, 2.0 + next(), 1.0, 0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 0.9]);
+        }
+        let splats = Splats::new(rows, sh, Vec::new(), 1, ShBasis::Standard).unwrap();
+        let options = RasterOptions::new(Convention::Standard);
+        let page = Page { splats: &splats, cameras: &[], options: &options, title: "a" };
+        let place = tempfile::tempdir().unwrap();
+        let (path, save) = (place.path().join("a.html"), SaveOptions::default());
+        let whole = page.write(&path, &save).unwrap();
+        assert_eq!((whole.count, whole.sh_degree), (3600, 1));
+        let rest = TEMPLATE.len() + STYLE.len() + VIEWER.len();
+        let within = |most: usize| {
+            let report = page.write_within(&path, &save, most, &mut Renderer::default()).unwrap();
+            assert!(report.bytes as usize <= most + most / 20, "{} of {most}", report.bytes);
+            (report.count, report.sh_degree)
+        };
+        let scene = whole.bytes as usize - rest;
+        assert_eq!(within(whole.bytes as usize + 100), (3600, 1));
+        assert_eq!(within(rest + scene * 9 / 10), (3600, 0));
+        let (count, degree) = within(rest + scene / 5);
+        assert!(degree == 0 && (600..2400).contains(&count), "{count}");
+        // More Gaussians than could fit are reduced without an encoding.
+        let (count, _) = within(rest + 8000);
+        assert!((100..700).contains(&count), "{count}");
     }
 }

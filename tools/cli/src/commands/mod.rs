@@ -7,6 +7,7 @@
 //! one object: the report, or `{"error": …}`.
 
 pub mod args;
+mod browser;
 mod check;
 pub mod depth_colour;
 pub mod environment;
@@ -49,6 +50,9 @@ pub fn main() -> ExitCode {
     if let Some(conflict) = cli.command.conflict() {
         let error = Cli::command().error(ErrorKind::ArgumentConflict, conflict);
         return failure::report_usage(&error);
+    }
+    if cli.quiet {
+        crate::report::be_quiet();
     }
     if cli.command.uses_gpu() {
         environment::restart_for_gpu();

@@ -279,6 +279,8 @@ pub fn write_config(out: &Path, config: &Config) -> Result<()> {
 const SPZ_COUNT_MAX: u64 = 10_000_000;
 /// Largest .glb: its header counts bytes with 32 bits.
 const GLB_BYTES_MAX: u64 = u32::MAX as u64;
+/// Size of a page that nobody asked for by name, bytes.
+const PAGE_BYTES: usize = 12_000_000;
 /// Size of a scene file that is announced before the work, bytes.
 const ANNOUNCED: u64 = 90_000_000;
 /// Largest .ply with SH of degree 3 by default; a larger one has the scene's own degree.
@@ -303,9 +305,12 @@ fn bytes_at_most(format: SceneFormatArg, count: u64, stored: usize, asked: Optio
 /// Refuses formats that cannot hold the scene of a run, before the work, and prints the size of
 /// large files. The scene has at most `count` Gaussians with SH of `degree`.
 pub fn check_formats(args: &RunArgs, count: u64, degree: usize) -> Result<()> {
-    for format in &args.save {
+    for format in &args.formats() {
         let written = written_degree(args.content.sh, count, degree);
         let bytes = bytes_at_most(*format, count, degree, written);
+        if *format == SceneFormatArg::Html && !args.whole_page() {
+            continue;
+        }
         check_format(*format, count, bytes, args.content.min_opacity)?;
         if *format == SceneFormatArg::Ply && bytes > ANNOUNCED {
             let [ply, spz] = [bytes, bytes_at_most(SceneFormatArg::Spz, count, degree, written)]
@@ -359,26 +364,15 @@ fn check_format(format: SceneFormatArg, count: u64, bytes: u64, min_opacity: f32
     Ok(())
 }
 
-/// Writes the Gaussians in each of `formats`, and returns one report each.
-pub fn write_scene(
-    out: &Path,
-    page: &Page<'_>,
-    formats: &[SceneFormatArg],
-    options: &SaveOptions,
-) -> Result<Vec<Value>> {
-    let mut distinct: Vec<SceneFormatArg> = Vec::new();
-    for format in formats {
-        if !distinct.contains(format) {
-            distinct.push(*format);
-        }
-    }
+/// Writes the Gaussians in each format of `args`, and returns one report each.
+pub fn write_scene(args: &RunArgs, page: &Page<'_>, options: &SaveOptions) -> Result<Vec<Value>> {
     let one = |format: &SceneFormatArg| {
-        let path = out.join(format.file_name());
+        let path = args.out.join(format.file_name());
         let html = *format == SceneFormatArg::Html;
-        let saved = if html {
-            page.write(&path, options)?
-        } else {
-            save_splats(&path, page.splats, options)?
+        let saved = match html {
+            true if args.whole_page() => page.write(&path, options)?,
+            true => page.write_within(&path, options, PAGE_BYTES, &mut Renderer::default())?,
+            false => save_splats(&path, page.splats, options)?,
         };
         let mut value = serde_json::to_value(&saved)?;
         if html {
@@ -387,7 +381,7 @@ pub fn write_scene(
         value["file"] = json!(path.display().to_string());
         Ok(value)
     };
-    distinct.iter().map(one).collect()
+    args.formats().iter().map(one).collect()
 }
 
 #[cfg(test)]

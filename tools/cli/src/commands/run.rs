@@ -1,11 +1,13 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
-use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderingArgs, RunArgs, SourceArgs};
+use super::args::{
+    LowpassArg, PATH_FRAMES, PathArg, RenderingArgs, RunArgs, SceneFormatArg, SourceArgs,
+};
 use super::frames::{self, DepthSpread};
 use super::html::Page;
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
-use super::{memory, model, pair, render, video};
+use super::{browser, memory, model, pair, render, video};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
@@ -14,13 +16,13 @@ use subsplat::files::SaveOptions;
 use subsplat::files::photos::image::{LoadOptions, Truncated};
 use subsplat::files::poses::scene::{Scene, SceneFormat};
 use subsplat::network::config::{Config, LowpassRef};
-use subsplat::reconstruct::Backend;
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
 use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
+use subsplat::reconstruct::{Assessment, Backend};
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{comment_of_camera, comment_of_options, comment_of_origin};
-use subsplat::scene::score::{GaussianReport, InputReport, Score};
+use subsplat::scene::score::GaussianReport;
 use subsplat::scene::splats::{SplatStatistics, Splats};
 use subsplat::{
     Detail, InputSize, Options, Photo, Reconstruction, Reconstructor, TargetSize, Warning,
@@ -110,7 +112,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
             options: &options,
             title: &plan.scene.name,
         };
-        output::write_scene(&args.out, &page, &args.save, &save)
+        output::write_scene(args, &page, &save)
     })?;
     let mut renderer = render::open(&args.rendering);
     let scored = progress
@@ -119,8 +121,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let near_far = NearFar::new(bounds.near, bounds.far);
     output::write_cameras(&args.out, &scored, &plan.scene, near_far)?;
     let video = video::finish(job.video.take(), &args.motion, answer)?;
-    let inputs = progress.stage("inputs", |_| input_report(&result, &options))?;
-    Done { model, result, options, scored, inputs, files, video }
+    let assessment = progress.stage("inputs", |_| result.assess(&mut renderer, &options))?;
+    Done { model, result, options, scored, assessment, files, video }
         .finish(args, &plan, progress, answer)
 }
 
@@ -132,21 +134,10 @@ fn crop_of(model: &Reconstructor, result: &Reconstruction) -> CropOptions {
     CropOptions { target_size, ..model.crop_options(input) }
 }
 
-/// Scores the scene at its inputs' own cameras, and describes its Gaussians.
-fn input_report(result: &Reconstruction, options: &RasterOptions) -> Result<InputReport> {
-    let (mut scores, mut coverage) = (Vec::new(), 0.0);
-    for input in result.inputs() {
-        let picture = subsplat::scene::render(result.splats(), &input.target_camera, options);
-        scores.push(Score::of_kept(&picture.rgb, &input.target, input.target_mask.as_ref())?);
-        let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
-        coverage += alpha / (picture.alpha.len() * result.inputs().len()) as f64;
-    }
+/// Describes the Gaussians of a scene that covers its inputs' pictures by `coverage`.
+fn distribution(result: &Reconstruction, coverage: f64) -> Option<GaussianReport> {
     let cameras: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
-    let statistics = SplatStatistics::new(result.splats(), &cameras);
-    Ok(InputReport {
-        inputs: Score::mean(&scores),
-        gaussians: statistics.map(|s| GaussianReport::new(&s, coverage)),
-    })
+    SplatStatistics::new(result.splats(), &cameras).map(|s| GaussianReport::new(&s, coverage))
 }
 
 /// Rejects a least opacity that leaves nothing to save, before any picture is rendered.
@@ -271,7 +262,7 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
     };
     if chosen.is_empty() {
         print_line(format!(
-            "no photographs are left to compare with: {} views are drawn on the way from the first camera to the last",
+            "no photographs are left to compare with: {} views are drawn between the photographs",
             path_frames(args)
         ));
     }
@@ -322,6 +313,8 @@ fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<V
         PathArg::Targets if !targets.is_empty() => {
             return Ok(targets.iter().map(|&i| View::Frame(i)).collect());
         }
+        // The photographs themselves show the other views.
+        PathArg::Targets if args.motion.video.is_none() => frames::between(&inputs, frames)?,
         PathArg::Targets | PathArg::Interpolate => frames::interpolate(&inputs, frames)?,
     };
     Ok(path.into_iter().map(View::Path).collect())
@@ -363,7 +356,7 @@ struct Done {
     result: Reconstruction,
     options: RasterOptions,
     scored: Vec<Scored>,
-    inputs: InputReport,
+    assessment: Assessment,
     files: Vec<Value>,
     video: Value,
 }
@@ -420,8 +413,9 @@ impl Done {
                 })
             ),
             "gaussians": result.splats().len(),
-            "inputs": self.inputs.inputs,
-            "distribution": self.inputs.gaussians,
+            "inputs": self.assessment.inputs,
+            "agreement": self.assessment.agreement,
+            "distribution": distribution(result, self.assessment.coverage),
             "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
             "psnr": self.mean(|s| s.psnr),
             "ssim": self.mean(|s| s.ssim),
@@ -449,6 +443,13 @@ impl Done {
             args.out.display(),
             peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
         ));
+        if args.formats().contains(&SceneFormatArg::Html) {
+            let page = args.out.join(SceneFormatArg::Html.file_name());
+            answer.line(format!("to look around in the scene, open {}", page.display()));
+            if args.open {
+                browser::open(&page);
+            }
+        }
         answer.finish(&report)
     }
 

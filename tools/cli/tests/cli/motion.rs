@@ -19,6 +19,19 @@ fn run_without_targets_draws_three_views_and_a_path_draws_what_is_asked() {
     assert!(report["video"].is_null());
     let depth = load(place.path().join("out/depth_colour/path_0001.png")).unwrap();
     let view = load(place.path().join("out/images/path_0001.png")).unwrap();
+    // The scene and a page that shows it, and none of the photographs' own views.
+    let files: Vec<&str> =
+        report["files"].as_array().unwrap().iter().map(|f| f["format"].as_str().unwrap()).collect();
+    assert_eq!(files, ["ply", "html"]);
+    assert!(place.path().join("out/scene.html").is_file());
+    assert!(called.stderr.contains("to look around in the scene, open out/scene.html"));
+    let cameras = load_cameras_json(place.path().join("out/cameras.json")).unwrap().cameras;
+    let scene = load_cameras_json(place.path().join("scene/cameras.json")).unwrap().cameras;
+    for view in &cameras {
+        let nearest =
+            scene[..2].iter().map(|c| c.camera.position().distance(view.camera.position()));
+        assert!(nearest.fold(f32::INFINITY, f32::min) > 0.01);
+    }
     assert!(depth.width > view.width && depth.height == view.height);
 
     let moving = "--path dolly --frames 4 --orbit-radius 0.1 --fps 10 --video out/dolly.webp";

@@ -61,6 +61,9 @@ pub struct Cli {
     /// All else goes to stderr.
     #[arg(long, global = true)]
     pub json: bool,
+    /// Print warnings, errors and the answer alone.
+    #[arg(short, long, global = true)]
+    pub quiet: bool,
     /// Number of threads (default: one for each core).
     ///
     /// The result does not depend on it. The environment variable RAYON_NUM_THREADS sets it too.

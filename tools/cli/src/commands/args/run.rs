@@ -25,11 +25,15 @@ pub struct RunArgs {
     /// replaced.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
-    /// Formats of the scene file.
+    /// Formats of the scene file (default: ply and html).
     ///
-    /// The files are named scene.ply and so on.
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
+    /// The files are named scene.ply and so on. Without this flag the page scene.html has at most 12 MB: of a larger
+    /// scene it gets one colour for all views, then fewer splats.
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "F,…")]
     pub save: Vec<SceneFormatArg>,
+    /// Open the page with the scene in the browser at the end.
+    #[arg(long)]
+    pub open: bool,
     /// Content of the scene files.
     #[command(flatten)]
     pub content: ContentArgs,
@@ -81,6 +85,27 @@ pub enum PictureSizeArg {
 }
 
 impl RunArgs {
+    /// Formats of the scene file, each once.
+    pub fn formats(&self) -> Vec<SceneFormatArg> {
+        let mut formats = Vec::new();
+        let asked = match self.save.as_slice() {
+            [] => &[SceneFormatArg::Ply, SceneFormatArg::Html],
+            asked => asked,
+        };
+        let page = self.open.then_some(&SceneFormatArg::Html);
+        for format in asked.iter().chain(page) {
+            if !formats.contains(format) {
+                formats.push(*format);
+            }
+        }
+        formats
+    }
+
+    /// Whether the page was asked for by name, and holds the scene whatever its size.
+    pub fn whole_page(&self) -> bool {
+        self.save.contains(&SceneFormatArg::Html)
+    }
+
     /// Size of the pictures: --size, else --upscale times the input; with the best quality that of the
     /// photographs.
     pub fn target_size(&self) -> TargetSize {

@@ -1,0 +1,229 @@
+//! Judges a finished scene by its photographs alone, without any view that was held back.
+//!
+//! A scene gives its own photographs back whether or not its shapes are right, because it was optimised on them.
+//! Two things tell more. The surface that a photograph shows must lie where the other photographs show theirs
+//! ([`Agreement::consistent`]), and the colours of the photographs must match better over this surface than at equal
+//! places of the pictures ([`Agreement::gain`]). Both compare rendered depths with photographs; rendered colours do
+//! not enter.
+
+use super::{Error, Reconstruction, Result};
+use crate::reconstruct::inputs::crop::Cropped;
+use crate::reconstruct::inputs::pair::choose_sources;
+use crate::scene::pictures::Rgb;
+use crate::scene::render::{Picture, Renderer};
+use crate::scene::score::Score;
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+use serde::Serialize;
+use subsplat_kernels::camera::{Camera, Size};
+use subsplat_kernels::layout::RasterOptions;
+
+/// Longest side of the grid of points at which photographs are compared.
+const GRID: usize = 256;
+/// Other photographs with which each one is compared.
+const SOURCES: usize = 2;
+/// Largest distance of a consistent point from its pixel, there and back, as a share of the picture's width:
+/// 1.3 px of 256.
+const CONSISTENT: f32 = 0.005;
+/// Least alpha of a pixel whose depth counts.
+const OPAQUE: f32 = 0.5;
+
+/// Agreement of the photographs over the scene's surface, means over pairs of photographs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[non_exhaustive]
+pub struct Agreement {
+    /// Share of the photographs' pixels whose surface another photograph shows, in [0, 1].
+    pub shared: f64,
+    /// Share of the shared pixels whose point, moved to the other photograph and back by its surface, returns
+    /// within 0.5 % of the picture's width, in [0, 1].
+    pub consistent: f64,
+    /// PSNR of the other photograph's colours, fetched over the surface, dB.
+    pub over_surface: f64,
+    /// PSNR of the other photograph's colours at the same places, dB.
+    pub at_same_place: f64,
+    /// Median displacement of a point by the distance between the cameras, share of the picture's width.
+    pub parallax: f64,
+}
+
+impl Agreement {
+    /// Decibels that the surface gains over a copy of the other photograph.
+    pub fn gain(&self) -> f64 {
+        self.over_surface - self.at_same_place
+    }
+}
+
+/// A scene as its photographs' own cameras see it, and its judgement.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
+pub struct Assessment {
+    /// Scores of the pictures at the inputs' own cameras, at the target's size.
+    pub inputs: Option<Score>,
+    /// Mean alpha of these pictures.
+    pub coverage: f64,
+    /// Agreement of the photographs.
+    pub agreement: Agreement,
+}
+
+/// Depths of a picture on a grid.
+struct Surface<'a> {
+    camera: Camera,
+    photograph: &'a Rgb,
+    /// Points across and down.
+    grid: Size,
+    /// Camera z of each point; 0 where there is none.
+    depth: Vec<f32>,
+}
+
+impl<'a> Surface<'a> {
+    fn new(input: &'a Cropped, picture: &Picture) -> Self {
+        let size = Size::new(picture.width, picture.height);
+        let step = size.width.max(size.height).div_ceil(GRID).max(1);
+        let grid = Size::new(size.width / step, size.height / step);
+        let mask = input.target_mask.as_ref();
+        let depth = |i: usize| {
+            let at =
+                (i / grid.width * step + step / 2) * size.width + i % grid.width * step + step / 2;
+            let kept = mask.is_none_or(|mask| mask.kept().get(at) != Some(&false));
+            if kept && picture.alpha[at] >= OPAQUE { picture.depth[at] } else { 0.0 }
+        };
+        let depth = (0..grid.width * grid.height).map(depth).collect();
+        Self { camera: input.target_camera, photograph: &input.target, grid, depth }
+    }
+
+    fn size(&self) -> Vec2 {
+        Vec2::new(self.photograph.width as f32, self.photograph.height as f32)
+    }
+
+    /// Centre of point `i` in the picture, px.
+    fn place(&self, i: usize) -> Vec2 {
+        let (x, y) = (i % self.grid.width, i / self.grid.width);
+        let share = Vec2::new(
+            (x as f32 + 0.5) / self.grid.width as f32,
+            (y as f32 + 0.5) / self.grid.height as f32,
+        );
+        share * self.size()
+    }
+
+    /// Camera z at a place of the picture; `None` outside the picture and where there is no surface.
+    fn depth_at(&self, at: Vec2) -> Option<f32> {
+        let share = at / self.size();
+        if !(share.min_element() >= 0.0 && share.max_element() < 1.0) {
+            return None;
+        }
+        let (x, y) = (share.x * self.grid.width as f32, share.y * self.grid.height as f32);
+        let depth = self.depth[y as usize * self.grid.width + x as usize];
+        (depth > 0.0).then_some(depth)
+    }
+
+    /// World position of the surface at a place of the picture.
+    fn point(&self, at: Vec2, depth: f32) -> Vec3 {
+        let ray = self.camera.intrinsics().unproject(at);
+        self.camera.world_from_camera().transform_point3(ray * depth)
+    }
+
+    /// Colour at a place of the picture, between the four nearest pixels.
+    fn colour(&self, at: Vec2) -> Vec3 {
+        let Rgb { width, height, data } = self.photograph;
+        let at = at - 0.5;
+        let low = at.floor();
+        let part = at - low;
+        let pixel = |dx: f32, dy: f32| {
+            let x = ((low.x + dx).max(0.0) as usize).min(width - 1);
+            let y = ((low.y + dy).max(0.0) as usize).min(height - 1);
+            let i = 3 * (y * width + x);
+            Vec3::new(f32::from(data[i]), f32::from(data[i + 1]), f32::from(data[i + 2])) / 255.0
+        };
+        pixel(0.0, 0.0)
+            .lerp(pixel(1.0, 0.0), part.x)
+            .lerp(pixel(0.0, 1.0).lerp(pixel(1.0, 1.0), part.x), part.y)
+    }
+}
+
+/// One shared point of two photographs.
+struct Shared {
+    consistent: bool,
+    /// Squared differences of colour, sums over the channels: over the surface, at the same place.
+    differences: [f64; 2],
+    parallax: f32,
+}
+
+/// Compares the point `i` of `from` with the photograph `to`; `None` where `to` does not show it.
+fn compare(from: &Surface<'_>, to: &Surface<'_>, i: usize) -> Option<Shared> {
+    let depth = from.depth[i];
+    if !(depth > 0.0) {
+        return None;
+    }
+    let at = from.place(i);
+    let point = from.point(at, depth);
+    let there = to.camera.project(point)?;
+    let other = to.depth_at(there)?;
+    let back = from.camera.project(to.point(there, other));
+    let width = from.size().x;
+    let colour = from.colour(at);
+    let difference = |other: Vec3| f64::from((colour - other).length_squared());
+    // The direction alone, which a turned camera would show there.
+    let direction = point - from.camera.position();
+    let turned = to.camera.project(to.camera.position() + direction);
+    Some(Shared {
+        consistent: back.is_some_and(|back| back.distance(at) <= CONSISTENT * width),
+        differences: [
+            difference(to.colour(there)),
+            difference(to.colour(at / from.size() * to.size())),
+        ],
+        parallax: turned.map_or(0.0, |t| t.distance(there) / width),
+    })
+}
+
+fn agreement(surfaces: &[Surface<'_>], sources: &[Vec<usize>]) -> Agreement {
+    let mut points = 0;
+    let mut shared: Vec<Shared> = Vec::new();
+    for (i, from) in surfaces.iter().enumerate() {
+        for &j in &sources[i] {
+            let count = from.depth.len();
+            let found: Vec<Shared> =
+                (0..count).into_par_iter().filter_map(|p| compare(from, &surfaces[j], p)).collect();
+            points += count;
+            shared.extend(found);
+        }
+    }
+    let n = shared.len() as f64;
+    if shared.is_empty() {
+        return Agreement::default();
+    }
+    let decibels = |k: usize| {
+        let sum: f64 = shared.iter().map(|s| s.differences[k]).sum();
+        -10.0 * (sum / (3.0 * n)).max(1e-10).log10()
+    };
+    let mut parallax: Vec<f32> = shared.iter().map(|s| s.parallax).collect();
+    parallax.sort_by(f32::total_cmp);
+    Agreement {
+        shared: n / points as f64,
+        consistent: shared.iter().filter(|s| s.consistent).count() as f64 / n,
+        over_surface: decibels(0),
+        at_same_place: decibels(1),
+        parallax: f64::from(parallax[parallax.len() / 2]),
+    }
+}
+
+impl Reconstruction {
+    /// Draws the scene at its inputs' own cameras by the rules `options`, and judges it.
+    ///
+    /// # Errors
+    /// A picture that cannot be scored: fewer than 11 pixels a side.
+    pub fn assess(&self, renderer: &mut Renderer, options: &RasterOptions) -> Result<Assessment> {
+        let (mut scores, mut surfaces, mut coverage) = (Vec::new(), Vec::new(), 0.0);
+        for (i, input) in self.inputs.iter().enumerate() {
+            let picture = renderer.render(&self.splats, &input.target_camera, options);
+            let score = Score::of_kept(&picture.rgb, &input.target, input.target_mask.as_ref());
+            let place = || format!("photograph {i}");
+            scores.push(score.map_err(|source| Error::Score { place: place(), source })?);
+            let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
+            coverage += alpha / (picture.alpha.len() * self.inputs.len()) as f64;
+            surfaces.push(Surface::new(input, &picture));
+        }
+        let cameras: Vec<Camera> = self.inputs.iter().map(|c| c.target_camera).collect();
+        let sources = choose_sources(&cameras, self.bounds.near_far(), SOURCES);
+        let agreement = agreement(&surfaces, &sources);
+        Ok(Assessment { inputs: Score::mean(&scores), coverage, agreement })
+    }
+}
