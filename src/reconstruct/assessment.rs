@@ -6,7 +6,7 @@
 //! places of the pictures ([`Agreement::gain`]). Both compare rendered depths with photographs; rendered colours do
 //! not enter.
 
-use super::{Error, Reconstruction, Result};
+use super::{Error, Reconstruction, Result, SceneVerdict};
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::reconstruct::inputs::pair::choose_sources;
 use crate::scene::pictures::Rgb;
@@ -53,7 +53,7 @@ impl Agreement {
 }
 
 /// A scene as its photographs' own cameras see it, and its judgement.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct Assessment {
     /// Scores of the pictures at the inputs' own cameras, at the target's size.
@@ -62,6 +62,8 @@ pub struct Assessment {
     pub coverage: f64,
     /// Agreement of the photographs.
     pub agreement: Agreement,
+    /// The verdict.
+    pub verdict: SceneVerdict,
 }
 
 /// Depths of a picture on a grid.
@@ -224,6 +226,70 @@ impl Reconstruction {
         let cameras: Vec<Camera> = self.inputs.iter().map(|c| c.target_camera).collect();
         let sources = choose_sources(&cameras, self.bounds.near_far(), SOURCES);
         let agreement = agreement(&surfaces, &sources);
-        Ok(Assessment { inputs: Score::mean(&scores), coverage, agreement })
+        let verdict = SceneVerdict::new(&agreement, coverage, &self.reports);
+        Ok(Assessment { inputs: Score::mean(&scores), coverage, agreement, verdict })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Mat4;
+    use subsplat_kernels::camera::Intrinsics;
+
+    const SIDE: usize = 64;
+
+    /// A camera at `x` that looks along +z.
+    fn camera(x: f32) -> Camera {
+        let k = Intrinsics::from_fov_x(0.9, SIDE, SIDE);
+        Camera::new(k, Mat4::from_translation(Vec3::new(x, 0.0, 0.0))).unwrap()
+    }
+
+    /// The photograph of a smooth texture on the plane z = 2.
+    fn photograph(camera: &Camera) -> Rgb {
+        let mut data = Vec::new();
+        for i in 0..SIDE * SIDE {
+            let at = Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5);
+            let ray = camera.intrinsics().unproject(at) * 2.0;
+            let p = camera.world_from_camera().transform_point3(ray);
+            let wave = |f: f32| (127.0 + 120.0 * (f * p.x + 0.3 * f * p.y).sin()) as u8;
+            data.extend([wave(9.0), wave(13.0), wave(17.0)]);
+        }
+        Rgb { width: SIDE, height: SIDE, data }
+    }
+
+    /// The agreement of two photographs 0.3 apart whose surfaces lie at these depths.
+    fn agreement_at(depths: [&dyn Fn(usize) -> f32; 2]) -> Agreement {
+        let cameras = [camera(0.0), camera(0.3)];
+        let photographs = cameras.each_ref().map(photograph);
+        let surface = |i: usize| Surface {
+            camera: cameras[i],
+            photograph: &photographs[i],
+            grid: Size::new(SIDE, SIDE),
+            depth: (0..SIDE * SIDE).map(depths[i]).collect(),
+        };
+        agreement(&[surface(0), surface(1)], &[vec![1], vec![0]])
+    }
+
+    #[test]
+    fn the_true_surface_agrees_and_others_do_not() {
+        let plane = |_: usize| 2.0;
+        let truth = agreement_at([&plane, &plane]);
+        assert!(truth.consistent > 0.999 && truth.gain() > 15.0, "{truth:?}");
+        // f·b/z px of 64, and what both see of the plane.
+        let shift = f64::from(camera(0.0).intrinsics().fx * 0.3 / 2.0) / SIDE as f64;
+        assert!((truth.parallax - shift).abs() < 1e-3, "{truth:?}");
+        assert!((truth.shared - (1.0 - shift)).abs() < 0.02, "{truth:?}");
+        // Equal wrong planes agree with each other, not with the colours.
+        let far = |_: usize| 4.0;
+        let wrong = agreement_at([&far, &far]);
+        assert!(wrong.consistent > 0.999 && wrong.gain() < 3.0, "{wrong:?}");
+        // Distances of noise agree in neither way.
+        let noise = |i: usize| 1.0 + (i * 7919 % 101) as f32 / 50.0;
+        let noisy = agreement_at([&noise, &noise]);
+        assert!(noisy.consistent < 0.3 && noisy.gain() < truth.gain() - 10.0, "{noisy:?}");
+        // No surface at all.
+        let none = agreement_at([&|_| 0.0, &|_| 0.0]);
+        assert_eq!(none, Agreement::default());
     }
 }

@@ -58,6 +58,7 @@ mod progress;
 mod reconstruction;
 mod reconstructor;
 mod unit;
+mod verdict;
 mod warning;
 
 pub use crate::network::model::Backend;
@@ -79,6 +80,7 @@ pub use prepared::Prepared;
 pub use progress::{Progress, Stage, StageTime};
 pub use reconstruction::Reconstruction;
 pub use reconstructor::Reconstructor;
+pub use verdict::{SceneVerdict, Trust};
 pub use warning::Warning;
 
 pub(crate) use children::{SceneChildren, counts_of};

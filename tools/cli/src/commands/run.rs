@@ -415,6 +415,8 @@ impl Done {
             "gaussians": result.splats().len(),
             "inputs": self.assessment.inputs,
             "agreement": self.assessment.agreement,
+            "coverage": self.assessment.coverage,
+            "verdict": self.assessment.verdict,
             "distribution": distribution(result, self.assessment.coverage),
             "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
             "psnr": self.mean(|s| s.psnr),
@@ -443,6 +445,7 @@ impl Done {
             args.out.display(),
             peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
         ));
+        answer.line(&self.assessment.verdict);
         if args.formats().contains(&SceneFormatArg::Html) {
             let page = args.out.join(SceneFormatArg::Html.file_name());
             answer.line(format!("to look around in the scene, open {}", page.display()));

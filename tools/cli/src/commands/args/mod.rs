@@ -62,7 +62,7 @@ pub struct Cli {
     #[arg(long, global = true)]
     pub json: bool,
     /// Print warnings, errors and the answer alone.
-    #[arg(short, long, global = true)]
+    #[arg(short, long, global = true, hide_short_help = true)]
     pub quiet: bool,
     /// Number of threads (default: one for each core).
     ///

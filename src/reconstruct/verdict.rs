@@ -1,0 +1,189 @@
+//! The verdict on a finished scene, in one sentence.
+//!
+//! RATES
+
+use super::Agreement;
+use crate::cameras::check::PairReport;
+use serde::Serialize;
+use std::fmt;
+
+/// Below it a scene is wrong: [`Agreement::consistent`].
+const WRONG_CONSISTENT: f64 = 0.15;
+/// The same where the check found that the cameras do not fit, and [`Agreement::gain`], dB.
+const DOUBTED_CONSISTENT: f64 = 0.3;
+const DOUBTED_GAIN: f64 = 3.0;
+/// Least values of a good scene.
+const GOOD_CONSISTENT: f64 = 0.4;
+const GOOD_GAIN: f64 = 5.0;
+/// Least share of the photographs that others show, below which nothing can be said of the surfaces.
+const LEAST_SHARED: f64 = 0.2;
+/// Least parallax of a good scene, share of the picture's width.
+const LEAST_PARALLAX: f64 = 0.04;
+/// Least mean alpha of a good scene's pictures at its inputs' cameras.
+const LEAST_COVERAGE: f64 = 0.85;
+
+/// How far a scene can be trusted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Trust {
+    /// The photographs agree on most of the surfaces that they share.
+    Good,
+    /// Views near the photographs are right; farther ones show wrong shapes or gaps.
+    NearPhotographs,
+    /// The surfaces are not those that the photographs show, although each photograph may look right.
+    Wrong,
+}
+
+/// The verdict on a scene. [`fmt::Display`] gives one sentence without a final full stop: the verdict, the likeliest
+/// cause and what to do about it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
+pub struct SceneVerdict {
+    /// How far the scene can be trusted.
+    pub trust: Trust,
+    /// The likeliest cause, and what to do; the agreement of a good scene.
+    pub reason: String,
+}
+
+impl fmt::Display for SceneVerdict {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let trust = match self.trust {
+            Trust::Good => "good",
+            Trust::NearPhotographs => "usable near the photographs",
+            Trust::Wrong => "wrong",
+        };
+        write!(f, "{trust}: {}", self.reason)
+    }
+}
+
+impl SceneVerdict {
+    /// Judges a scene by its agreement, the mean alpha of its pictures and the checks of its cameras.
+    pub(super) fn new(agreement: &Agreement, coverage: f64, reports: &[PairReport]) -> Self {
+        let finding = |code: &str| {
+            let mut all = reports.iter().flat_map(|r| &r.findings);
+            all.find(|f| f.code == code).map(|f| f.sentence.as_str())
+        };
+        let misfit = finding("poses_wrong");
+        let Agreement { consistent, shared, parallax, .. } = *agreement;
+        let low = consistent < DOUBTED_CONSISTENT || agreement.gain() < DOUBTED_GAIN;
+        let good = consistent >= GOOD_CONSISTENT && agreement.gain() >= GOOD_GAIN;
+        let agree = format!(
+            "the photographs agree on {} of the surfaces that they share",
+            percent(consistent)
+        );
+        let (trust, reason) = if shared < LEAST_SHARED {
+            (Trust::Wrong, little_shared(shared))
+        } else if consistent < WRONG_CONSISTENT || misfit.is_some() && low {
+            (Trust::Wrong, format!("{agree}; {}", cause_of_wrong(misfit)))
+        } else if parallax < LEAST_PARALLAX {
+            (Trust::NearPhotographs, little_parallax(parallax))
+        } else if coverage < LEAST_COVERAGE {
+            (Trust::NearPhotographs, little_coverage(coverage))
+        } else if misfit.is_some() || !good {
+            let cause = cause_of_doubt(misfit.or_else(|| finding("poses_imprecise")));
+            (Trust::NearPhotographs, format!("{agree}; {cause}"))
+        } else {
+            (Trust::Good, agree)
+        };
+        Self { trust, reason }
+    }
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.0} %", 100.0 * share)
+}
+
+fn little_shared(shared: f64) -> String {
+    format!(
+        "the photographs share {} of what they show; take photographs that show most of the same things",
+        percent(shared)
+    )
+}
+
+fn cause_of_wrong(misfit: Option<&str>) -> String {
+    match misfit {
+        Some(sentence) => format!(
+            "the likeliest cause are the cameras ({sentence}); the photographs alone, without the file of cameras, let \
+             the program estimate them"
+        ),
+        None => "the likeliest causes are things that moved, photographs of different places, or wrong cameras; \
+                 other photographs may help"
+            .to_owned(),
+    }
+}
+
+fn little_parallax(parallax: f64) -> String {
+    format!(
+        "things move by {:.1} % of the width between the photographs; photographs taken farther apart give better \
+         distances",
+        100.0 * parallax
+    )
+}
+
+fn little_coverage(coverage: f64) -> String {
+    format!(
+        "the splats cover {} of the photographs; more photographs fill the gaps",
+        percent(coverage)
+    )
+}
+
+fn cause_of_doubt(finding: Option<&str>) -> String {
+    match finding {
+        Some(sentence) => format!("{sentence}; --adjust-poses may help"),
+        None => "photographs taken closer together agree better".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cameras::check::{Finding, Verdict};
+
+    fn agreement(consistent: f64, gain: f64) -> Agreement {
+        let mut agreement = Agreement::default();
+        agreement.consistent = consistent;
+        (agreement.shared, agreement.parallax) = (0.7, 0.1);
+        (agreement.over_surface, agreement.at_same_place) = (10.0 + gain, 10.0);
+        agreement
+    }
+
+    fn report(code: &str) -> PairReport {
+        let sentence = "the lines miss the points by 9 px".to_owned();
+        let finding = Finding { severity: Verdict::Bad, code: code.to_owned(), sentence };
+        PairReport { findings: vec![finding], ..PairReport::default() }
+    }
+
+    #[test]
+    fn each_kind_of_scene_has_its_verdict() {
+        let judge = |agreement: &Agreement, coverage: f64, reports: &[PairReport]| {
+            SceneVerdict::new(agreement, coverage, reports)
+        };
+        let (wrong, near, good) = (Trust::Wrong, Trust::NearPhotographs, Trust::Good);
+        let poses = [PairReport::default(), report("poses_wrong")];
+        let cases = [
+            (agreement(0.7, 8.0), 0.95, &[][..], good, "agree on 70 %"),
+            (agreement(0.7, 3.0), 0.95, &[], near, "closer together"),
+            (agreement(0.3, 8.0), 0.95, &[], near, "agree on 30 %"),
+            (agreement(0.1, 8.0), 0.95, &[], wrong, "things that moved"),
+            (agreement(0.7, 8.0), 0.5, &[], near, "cover 50 %"),
+            (agreement(0.7, 8.0), 0.95, &poses, near, "miss the points by 9 px; --adjust-poses"),
+            (agreement(0.25, 8.0), 0.95, &poses, wrong, "miss the points by 9 px"),
+            (agreement(0.7, 2.0), 0.95, &poses, wrong, "without the file of cameras"),
+            (agreement(0.3, 8.0), 0.95, &[report("poses_imprecise")], near, "--adjust-poses"),
+        ];
+        for (agreement, coverage, reports, trust, words) in cases {
+            let verdict = judge(&agreement, coverage, reports);
+            assert_eq!(verdict.trust, trust, "{verdict}");
+            assert!(verdict.to_string().contains(words), "{verdict}");
+        }
+        let mut still = agreement(1.0, 12.0);
+        still.parallax = 0.011;
+        let verdict = judge(&still, 0.95, &[]);
+        assert!(verdict.trust == near && verdict.to_string().contains("1.1 % of the width"));
+        let mut apart = agreement(1.0, 12.0);
+        apart.shared = 0.1;
+        assert_eq!(judge(&apart, 0.95, &[]).trust, wrong);
+        // A scene that no photograph shares with another one has no agreement at all.
+        assert_eq!(judge(&Agreement::default(), 0.0, &[]).trust, wrong);
+    }
+}
