@@ -1,6 +1,7 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
 use super::args::{InputSizeArg, PictureSizeArg};
+use subsplat::reconstruct::{FisheyeCurve, FisheyeLens, Projection};
 use subsplat::{Density, Refine};
 use subsplat_kernels::camera::Intrinsics;
 use subsplat_kernels::layout::CHILDREN_MAX;
@@ -138,6 +139,35 @@ pub fn minutes(text: &str) -> Result<f64, String> {
 /// Parses a field of view, degrees.
 pub fn fov(text: &str) -> Result<f32, String> {
     real(text, |v| v > 0.0 && v < 180.0, "degrees above 0 and below 180")
+}
+
+/// Parses the lens of photographs: `pinhole`, `panorama`, or `fisheye` with an angle, degrees, and a curve.
+pub fn projection(text: &str) -> Result<Projection, String> {
+    let expected = || {
+        "expected pinhole, panorama or fisheye[:DEGREES][:equidistant|equisolid|stereographic], with 20 to 300 \
+         degrees"
+            .to_owned()
+    };
+    let mut words = text.split(':');
+    match (words.next(), text.contains(':')) {
+        (Some("pinhole"), false) => return Ok(Projection::Pinhole),
+        (Some("panorama"), false) => return Ok(Projection::Panorama),
+        (Some("fisheye"), _) => {}
+        _ => return Err(expected()),
+    }
+    let mut lens = FisheyeLens::default();
+    for (i, word) in words.enumerate() {
+        match (word, word.parse::<f64>()) {
+            (_, Ok(degrees)) if i == 0 && (20.0..=300.0).contains(&degrees) => {
+                lens.angle = degrees.to_radians();
+            }
+            ("equidistant", _) if i < 2 => lens.curve = FisheyeCurve::Equidistant,
+            ("equisolid", _) if i < 2 => lens.curve = FisheyeCurve::Equisolid,
+            ("stereographic", _) if i < 2 => lens.curve = FisheyeCurve::Stereographic,
+            _ => return Err(expected()),
+        }
+    }
+    Ok(Projection::Fisheye(lens))
 }
 
 /// Parses a least opacity.
