@@ -242,6 +242,35 @@ mod tests {
     use super::*;
 
     #[test]
+    fn lenses_of_photographs() {
+        assert_eq!(projection("pinhole"), Ok(Projection::Pinhole));
+        assert_eq!(projection("panorama"), Ok(Projection::Panorama));
+        let fisheye = |degrees: f64, curve| {
+            Ok(Projection::Fisheye(FisheyeLens { angle: degrees.to_radians(), curve }))
+        };
+        assert_eq!(projection("fisheye"), fisheye(180.0, FisheyeCurve::Equidistant));
+        assert_eq!(projection("fisheye:190"), fisheye(190.0, FisheyeCurve::Equidistant));
+        assert_eq!(projection("fisheye:equisolid"), fisheye(180.0, FisheyeCurve::Equisolid));
+        let both = projection("fisheye:150.5:stereographic");
+        assert_eq!(both, fisheye(150.5, FisheyeCurve::Stereographic));
+        let wrong = [
+            "",
+            "lens",
+            "panorama:180",
+            "pinhole:",
+            "fisheye:",
+            "fisheye:5",
+            "fisheye:400",
+            "fisheye:NaN",
+            "fisheye:equisolid:180",
+            "fisheye:180:equisolid:1",
+        ];
+        for text in wrong {
+            assert!(projection(text).unwrap_err().contains("stereographic"), "{text}");
+        }
+    }
+
+    #[test]
     fn numbers_of_gaussians() {
         assert_eq!((density("auto"), density("100%")), (Ok(Density::Auto), Ok(Density::Full)));
         assert_eq!(density(" 25 %"), Ok(Density::Share(0.25)));
