@@ -82,9 +82,9 @@ fn check_frames(found: &EstimatedScene, photographs: usize) {
 fn check_cameras(found: &EstimatedScene, turn: f64, direction: f64) {
     assert_eq!(found.estimate.confidence, Confidence::High, "{:?}", found.estimate.warnings);
     let cameras: Vec<Camera> = found.estimate.cameras.iter().map(|c| c.unwrap()).collect();
-    for i in 1..cameras.len() {
-        let truth = [0, i].map(|i| true_camera(places()[i], cameras[i].intrinsics()));
-        let errors = relative_errors([&cameras[0], &cameras[i]], truth.each_ref());
+    for (i, camera) in cameras.iter().enumerate().skip(1) {
+        let truth = [0, i].map(|i| true_camera(places()[i], camera.intrinsics()));
+        let errors = relative_errors([&cameras[0], camera], truth.each_ref());
         assert!(errors[0] < turn && errors[1] < direction, "{i}: {errors:?}");
     }
 }
