@@ -125,6 +125,8 @@ fn colmap(
     let name = |name: PathBuf| name.to_string_lossy().replace('\\', "/");
     let images = names.into_iter().map(name).zip(frames.iter().map(|f| f.camera)).collect();
     let points = estimated.estimate.points.iter().zip(&estimated.observations);
+    // Points above and below all views of a panorama.
+    let points = points.filter(|(_, observations)| observations.len() >= 2);
     let points = points.map(|(p, observations)| SparsePoint {
         position: p.position,
         colour: p.colour,
