@@ -307,7 +307,10 @@ fn a_view_of_a_fisheye_picture_is_the_pinhole_picture() {
     let size = [640, 480];
     for (lens, inverse) in [
         (Distortion::fisheye([0.0; 4]), (|f: f64| f) as fn(f64) -> f64),
-        (Distortion::Fov { omega: 1.2 }, |d| ((d * 1.2).tan() / (2.0 * 0.6f64.tan())).atan()),
+        (
+            Distortion::Fov { omega: 1.2 },
+            (|d: f64| ((d * 1.2).tan() / (2.0 * 0.6f64.tan())).atan()) as fn(f64) -> f64,
+        ),
     ] {
         // 230 px for 80 degrees from the axis.
         let focal = 230.0 / lens.project(DVec3::new(80f64.to_radians().tan(), 0.0, 1.0)).unwrap().x;
