@@ -41,12 +41,17 @@ pub enum Error {
     #[error(transparent)]
     PosePhoto(#[from] PosePhotoError),
     /// The photographs alone do not determine their cameras.
-    #[error("{photographs}: the photographs do not tell where their cameras were: {reason}")]
+    #[error(
+        "{photographs}: the photographs do not tell where their cameras were: {reason}{}",
+        noted(warnings)
+    )]
     NoPoses {
         /// The photographs.
         photographs: String,
         /// The reason.
         reason: PoseRefusal,
+        /// Warnings about the photographs, one line each.
+        warnings: Vec<String>,
     },
     /// A picture cannot be scored.
     #[error("{place}: {source}")]
@@ -82,6 +87,15 @@ impl Error {
         got: impl Into<String>,
     ) -> Self {
         Self::Argument { what: what.into(), expected: expected.into(), got: got.into() }
+    }
+}
+
+/// The first of `warnings` as an addition to a message.
+fn noted(warnings: &[String]) -> String {
+    match warnings {
+        [] => String::new(),
+        [one] => format!(" ({one})"),
+        [first, rest @ ..] => format!(" ({first}; and {} more warnings)", rest.len()),
     }
 }
 

@@ -1,15 +1,16 @@
 //! Estimates the cameras of photographs without a pose file: decodes them, takes what is known of
 //! their lenses, estimates the poses ([`crate::cameras::estimation`]), and returns photographs or a scene.
 
+use super::projections::{self, Posed, Projection, Shapes};
 use super::{Error, Photo, Result};
 use crate::cameras::estimation::{Lens, PoseEstimate, PoseOptions, PosePhoto, estimate_poses};
 use crate::files::photos::exif::FocalSource;
 use crate::files::photos::image::LoadOptions;
-use crate::files::photos::photograph::{Photograph, load_photograph};
+use crate::files::photos::photograph::Photograph;
 use crate::files::poses::scene::{Scene, SceneFormat};
 use std::fmt;
-use std::path::{Path, PathBuf};
-use subsplat_kernels::camera::{Camera, Intrinsics};
+use std::path::Path;
+use subsplat_kernels::camera::Intrinsics;
 
 /// Intrinsics of all photographs that the caller knows.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,6 +39,10 @@ pub enum LensSource {
     Exif(FocalSource),
     /// Nothing is known: 0.75 of the longer side.
     Assumed,
+    /// The photograph is a panorama, of which views are made.
+    Panorama,
+    /// The photograph is the picture of a fisheye lens, of which a view is made.
+    Fisheye,
 }
 
 impl fmt::Display for LensSource {
@@ -48,6 +53,8 @@ impl fmt::Display for LensSource {
             Self::Assumed => {
                 f.write_str("not stated: estimated from a start of 0.75 of the longer side")
             }
+            Self::Panorama => f.write_str("a view of a panorama"),
+            Self::Fisheye => f.write_str("a view of a fisheye picture, by its circle"),
         }
     }
 }
@@ -61,13 +68,18 @@ pub struct EstimateOptions {
     pub poses: PoseOptions,
     /// Decoding by [`estimate_cameras_of_files`].
     pub load: LoadOptions,
+    /// Projection of the photographs of [`estimate_cameras_of_files`]. With panoramas and fisheye pictures
+    /// [`EstimateOptions::lens`] has no effect.
+    pub projection: Projection,
 }
 
 /// Result of [`estimate_cameras_of_files`]: a scene with estimated cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EstimatedScene {
-    /// The photographs that have a camera, and the sparse points.
+    /// The photographs that have a camera, and the sparse points. A panorama becomes several frames.
     pub scene: Scene,
+    /// For each point of the estimate the frames of the scene that show it, with its position in them, px.
+    pub observations: Vec<Vec<(usize, [f32; 2])>>,
     /// The estimate; its indices count all photographs.
     pub estimate: PoseEstimate,
     /// Origin of each photograph's focal length.
@@ -114,7 +126,9 @@ pub fn estimate_cameras(
         pose_photos.push(PosePhoto::from_picture(image, mask.as_ref(), lens, features)?);
     }
     let estimate = estimate_poses(&pose_photos, &options.poses).map_err(|reason| {
-        Error::NoPoses { photographs: format!("{} photographs", photographs.len()), reason }
+        let warnings = photographs.iter().flat_map(|p| p.warnings.clone()).collect();
+        let photographs = format!("{} photographs", photographs.len());
+        Error::NoPoses { photographs, reason, warnings }
     })?;
     let photos = photographs
         .into_iter()
@@ -136,7 +150,7 @@ pub fn estimate_cameras(
 /// One photograph is decoded at a time, so that memory holds one at its full size.
 ///
 /// # Errors
-/// Those of [`load_photograph`]; a lens that is no valid camera; [`Error::NoPoses`]; the error of
+/// Those of [`load_photograph`](crate::load_photograph), but panoramas are accepted; a lens that is no valid camera; [`Error::NoPoses`]; the error of
 /// `photograph`.
 pub fn estimate_cameras_of_files(
     name: impl AsRef<Path>,
@@ -156,31 +170,30 @@ fn estimate_scene(
 ) -> Result<EstimatedScene> {
     let features = features_of(photographs.len());
     let mut warnings = Vec::new();
-    let (mut photos, mut lenses) = (Vec::new(), Vec::new());
+    let mut prepared = Vec::new();
     for (i, path) in photographs.iter().enumerate() {
         photograph(i)?;
-        let loaded = load_photograph(path, &options.load)?;
-        warnings.extend(loaded.warnings.iter().cloned());
-        let (lens, source) = lens(&loaded, options.lens);
-        lenses.push(source);
-        let Photograph { image, mask, .. } = loaded;
-        photos.push(PosePhoto::from_picture(&image, mask.as_ref(), lens, features)?);
+        let mut one = projections::prepare(path, options, features)?;
+        warnings.append(&mut one.warnings);
+        prepared.push(one);
     }
-    let estimate = estimate_poses(&photos, &options.poses).map_err(|reason| Error::NoPoses {
-        photographs: photographs_of(name, photographs),
-        reason,
-    })?;
-    let placed: Vec<(PathBuf, Camera)> = photographs
-        .iter()
-        .zip(&estimate.cameras)
-        .filter_map(|(path, camera)| Some((path.to_path_buf(), (*camera)?)))
-        .collect();
-    let mut scene = Scene::from_photographs(SceneFormat::Photographs, name, &placed)?;
+    let shapes = Shapes::new(&prepared);
+    let (photos, lenses): (Vec<PosePhoto>, Vec<LensSource>) =
+        prepared.into_iter().map(|p| (p.photo, p.source)).unzip();
+    warnings.extend(shapes.warning(&lenses));
+    let estimate = match estimate_poses(&photos, &options.poses) {
+        Ok(estimate) => estimate,
+        Err(reason) => {
+            let photographs = photographs_of(name, photographs);
+            return Err(Error::NoPoses { photographs, reason, warnings });
+        }
+    };
+    let Posed { views, observations } = shapes.posed(photographs, &estimate);
+    let mut scene = Scene::from_views(SceneFormat::Photographs, name, &views)?;
     scene.points = Some(estimate.points.iter().map(|p| p.position).collect());
-    for (index, point) in estimate.points.iter().enumerate() {
-        for (photo, _) in &point.observations {
-            let before = estimate.cameras[..*photo].iter().flatten().count();
-            if let (Some(frame), Ok(index)) = (scene.frames.get_mut(before), u32::try_from(index)) {
+    for (index, point) in observations.iter().enumerate() {
+        for (frame, _) in point {
+            if let (Some(frame), Ok(index)) = (scene.frames.get_mut(*frame), u32::try_from(index)) {
                 frame.visible.push(index);
             }
         }
@@ -189,11 +202,11 @@ fn estimate_scene(
     let file = |photo: usize| photographs[photo].display().to_string();
     scene.warnings.extend(estimate.left_out_sentences(file));
     scene.warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
-    Ok(EstimatedScene { scene, estimate, lenses })
+    Ok(EstimatedScene { scene, observations, estimate, lenses })
 }
 
 /// Returns the known part of a photograph's lens, and its source.
-fn lens(photograph: &Photograph, known: Option<KnownLens>) -> (Lens, LensSource) {
+pub(super) fn lens(photograph: &Photograph, known: Option<KnownLens>) -> (Lens, LensSource) {
     let (w, h) = (photograph.image.width, photograph.image.height);
     match (known, photograph.camera.focal) {
         (Some(known), _) => (Lens::known(known.intrinsics(w, h)), LensSource::Given),

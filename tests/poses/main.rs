@@ -4,4 +4,5 @@ mod adjusted;
 mod estimated_photos;
 mod many;
 mod pairs;
+mod panoramas;
 mod refused;

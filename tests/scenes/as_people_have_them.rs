@@ -137,7 +137,11 @@ fn what_is_broken_and_not_needed_is_left_out() {
         lenses
             .lines()
             .map(|line| {
-                if lens(line) { "8 FOV 64 48 1 1 1 1 1\n".to_owned() } else { format!("{line}\n") }
+                if lens(line) {
+                    "8 EUCM 64 48 1 1 1 1 1 1\n".to_owned()
+                } else {
+                    format!("{line}\n")
+                }
             })
             .collect();
     let poses: String = poses
@@ -153,7 +157,7 @@ fn what_is_broken_and_not_needed_is_left_out() {
     let names: Vec<&str> = scene.frames.iter().map(|f| f.name.as_str()).collect();
     assert_eq!(names, ["003", "004"]);
     let line = warning(&scene);
-    for words in ["3 of 5 frames are left out", "000.png", "an empty file", "got FOV", "NaN"] {
+    for words in ["3 of 5 frames are left out", "000.png", "an empty file", "got EUCM", "NaN"] {
         assert!(line.contains(words), "{words}: {line}");
     }
     // One frame alone is no scene: the error is the first entry's.

@@ -505,10 +505,10 @@ fn colmap_binary_with_hostile_fields() {
     for (case, file, bytes, words) in cases {
         check(case, BINARY[file].1(&bytes), words);
     }
-    let fov = put(0, 12, &7i32.to_le_bytes());
-    let mut fov = fov[..32 + 40].to_vec();
-    fov[..8].copy_from_slice(&1u64.to_le_bytes());
-    check("FOV model", BINARY[0].1(&fov), &["SIMPLE_RADIAL", "got FOV"]);
+    let eucm = put(0, 12, &16i32.to_le_bytes());
+    let mut eucm = eucm[..32 + 48].to_vec();
+    eucm[..8].copy_from_slice(&1u64.to_le_bytes());
+    check("EUCM model", BINARY[0].1(&eucm), &["SIMPLE_RADIAL", "got EUCM"]);
     // A camera that is missing in the cameras file.
     let (folder, _) = made_up(3);
     let images = put(1, 68, &55u32.to_le_bytes());
@@ -529,7 +529,7 @@ fn bad_colmap_text() {
     let cases: Vec<(&str, Result<(), subsplat::files::Error>, &[&str])> = vec![
         ("no cameras", cameras("# none\n"), &["x.txt", "at least one camera"]),
         ("id", cameras("\n\na PINHOLE 1 1 1 1 1 1"), &["x.txt:3", "camera id", "`a`"]),
-        ("model", cameras("1 FOV 6 4 1 1 1 1 1"), &["x.txt:1", "got FOV"]),
+        ("model", cameras("1 EUCM 6 4 1 1 1 1 1 1"), &["x.txt:1", "got EUCM"]),
         ("unknown model", cameras("1 LENS 6 4 1"), &["x.txt:1", "`LENS`"]),
         ("few parameters", cameras("1 PINHOLE 6 4 1 1 1"), &["4 parameters of PINHOLE", "got 3"]),
         ("many parameters", cameras("1 PINHOLE 6 4 1 1 1 1 1"), &["got 5"]),

@@ -4,6 +4,7 @@ mod as_people_have_them;
 mod check;
 mod check_rendered;
 mod hostile_scenes;
+mod lenses;
 mod metrics;
 mod navigation;
 mod photographs;

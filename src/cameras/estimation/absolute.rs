@@ -60,13 +60,21 @@ pub(super) struct Sight {
     pub bearing: DVec2,
     /// Standard deviation of the bearing, units of the plane.
     pub deviation: f64,
+    /// Rotation from the camera's axes to those of the view whose plane has the picture; `None` for the camera's
+    /// own plane.
+    pub view: Option<DMat3>,
+}
+
+/// A point of the camera's axes in those of a view.
+pub(super) fn in_view(view: Option<DMat3>, point: DVec3) -> DVec3 {
+    view.map_or(point, |view| view * point)
 }
 
 impl Sight {
     /// Distance between the point's picture and its projection, standard deviations; infinite
     /// behind the camera.
     fn residual(&self, pose: &Absolute) -> f64 {
-        let p = pose.to_camera(self.point);
+        let p = in_view(self.view, pose.to_camera(self.point));
         if p.z < 1e-9 {
             return f64::INFINITY;
         }
@@ -136,21 +144,33 @@ fn refine(start: &Absolute, sights: &[Sight], limit: f64, steps: usize) -> Absol
 
 /// Residual of a sight, standard deviations, and its derivative by the pose's six parameters.
 fn linear(pose: &Absolute, s: &Sight) -> (SVector<f64, 2>, SMatrix<f64, 2, 6>) {
-    let p = pose.to_camera(s.point);
+    let p = in_view(s.view, pose.to_camera(s.point));
     let off = (p.truncate() / p.z - s.bearing) / s.deviation;
-    (SVector::<f64, 2>::new(off.x, off.y), projection_slope(pose, s.point) / s.deviation)
+    (SVector::<f64, 2>::new(off.x, off.y), projection_slope(pose, s.view, s.point) / s.deviation)
 }
 
-/// Derivative of the projection on the plane z = 1 by the pose's six parameters.
-pub(super) fn projection_slope(pose: &Absolute, point: DVec3) -> SMatrix<f64, 2, 6> {
-    let p = pose.to_camera(point);
-    let slope = slope_in_camera(p);
+/// Derivative of the projection on the plane z = 1, the camera's or a view's, by the pose's six parameters.
+pub(super) fn projection_slope(
+    pose: &Absolute,
+    view: Option<DMat3>,
+    point: DVec3,
+) -> SMatrix<f64, 2, 6> {
+    let p = in_view(view, pose.to_camera(point));
+    let slope = match view {
+        None => slope_in_camera(p),
+        Some(view) => slope_in_camera(p) * matrix(view),
+    };
     let turn = cross_matrix(pose.rotation * point) * -1.0;
-    let turn = SMatrix::<f64, 3, 3>::from_column_slice(&turn.to_cols_array());
+    let turn = matrix(turn);
     let mut out = SMatrix::<f64, 2, 6>::zeros();
     out.fixed_view_mut::<2, 3>(0, 0).copy_from(&(slope * turn));
     out.fixed_view_mut::<2, 3>(0, 3).copy_from(&slope);
     out
+}
+
+/// nalgebra's form of a matrix.
+pub(super) fn matrix(m: DMat3) -> SMatrix<f64, 3, 3> {
+    SMatrix::<f64, 3, 3>::from_column_slice(&m.to_cols_array())
 }
 
 /// Derivative of p ↦ (p.x, p.y) / p.z.
@@ -162,7 +182,11 @@ pub(super) fn slope_in_camera(p: DVec3) -> SMatrix<f64, 2, 3> {
 /// Returns the poses, at most four, from which three points appear at their bearings.
 fn three_points(sights: &[Sight; 3]) -> Vec<Absolute> {
     let points = sights.map(|s| s.point);
-    let rays = sights.map(|s| s.bearing.extend(1.0).normalize());
+    let ray = |s: &Sight| {
+        let ray = s.bearing.extend(1.0).normalize();
+        s.view.map_or(ray, |view| view.transpose() * ray)
+    };
+    let rays = [ray(&sights[0]), ray(&sights[1]), ray(&sights[2])];
     let squared = |i: usize, j: usize| points[i].distance_squared(points[j]);
     let (a2, b2, c2) = (squared(1, 2), squared(0, 2), squared(0, 1));
     if !(a2.min(b2).min(c2) > 0.0) {
@@ -222,7 +246,7 @@ mod tests {
                 let p = DVec3::new(next(1.0), next(1.0), 4.0 + next(2.0));
                 let jitter = DVec2::new(next(noise), next(noise));
                 let point = pose.rotation.transpose() * (p - pose.translation);
-                Sight { point, bearing: p.truncate() / p.z + jitter, deviation: 1e-3 }
+                Sight { point, bearing: p.truncate() / p.z + jitter, deviation: 1e-3, view: None }
             })
             .collect();
         (pose, all)

@@ -6,9 +6,9 @@
 //!
 //! Source: B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000.
 
-use super::absolute::{Absolute, projection_slope, slope_in_camera};
+use super::absolute::{Absolute, in_view, matrix as converted, projection_slope, slope_in_camera};
 use super::refine::FocalPrior;
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
 /// A point's picture in a camera.
@@ -22,6 +22,8 @@ pub(super) struct Observation {
     pub bearing: DVec2,
     /// Standard deviation of the bearing, units of the plane.
     pub deviation: f64,
+    /// See [`Sight::view`](super::absolute::Sight::view).
+    pub view: Option<DMat3>,
 }
 
 /// Cameras, points and observations.
@@ -55,7 +57,7 @@ impl Observation {
         point: DVec3,
         log_focal: f64,
     ) -> Option<DVec2> {
-        let p = camera.to_camera(point);
+        let p = in_view(self.view, camera.to_camera(point));
         let projected = p.truncate() / p.z * log_focal.exp();
         (p.z > 1e-9).then(|| (projected - self.bearing) / self.deviation)
     }
@@ -136,11 +138,10 @@ impl Bundle {
             let point = self.points[o.point];
             let Some(r) = o.residual(camera, point, self.log_focal) else { continue };
             let weight = 1.0 / (1.0 + r.length_squared() / (LOSS_SCALE * LOSS_SCALE));
-            let p = camera.to_camera(point);
+            let p = in_view(o.view, camera.to_camera(point));
             let unit = scale / o.deviation;
-            let rotation =
-                SMatrix::<f64, 3, 3>::from_column_slice(&camera.rotation.to_cols_array());
-            let by_camera: Slope = projection_slope(camera, point) * unit;
+            let rotation = converted(o.view.map_or(camera.rotation, |view| view * camera.rotation));
+            let by_camera: Slope = projection_slope(camera, o.view, point) * unit;
             let by_point: PointSlope = slope_in_camera(p) * rotation * unit;
             let by_focal = SVector::<f64, 2>::new(p.x / p.z, p.y / p.z) * unit;
             let r = SVector::<f64, 2>::new(r.x, r.y);
@@ -327,7 +328,8 @@ mod tests {
                 let q = c.to_camera(*p);
                 let jitter = DVec2::new(random.normal(), random.normal()) * noise * deviation;
                 let bearing = q.truncate() / q.z * focal + jitter;
-                observations.push(Observation { camera, point, bearing, deviation });
+                let view = None;
+                observations.push(Observation { camera, point, bearing, deviation, view });
             }
         }
         Bundle { cameras, points, observations, log_focal: 0.0, prior: None }

@@ -266,6 +266,13 @@ pub fn estimate_poses(
     photos: &[PosePhoto],
     options: &PoseOptions,
 ) -> Result<PoseEstimate, PoseRefusal> {
+    // Views of one photograph have exact lenses, with which a common focal length is no unknown.
+    if photos.iter().any(PosePhoto::has_views)
+        && photos.iter().any(|photo| photo.lens.deviation > 0.0)
+    {
+        let exact: Vec<PosePhoto> = photos.iter().map(|photo| photo.with_focal(1.0)).collect();
+        return estimate_poses(&exact, options);
+    }
     match photos {
         [a, b] => two(a, b, options),
         [] | [_] => Err(PoseRefusal::TooFew { count: photos.len() }),
@@ -276,6 +283,10 @@ pub fn estimate_poses(
 /// Two photographs, with rotated descriptors where upright ones find too little.
 fn two(a: &PosePhoto, b: &PosePhoto, options: &PoseOptions) -> Result<PoseEstimate, PoseRefusal> {
     let upright = pair::estimate(a, b, true, options.seed);
+    // Panoramas turn by any angle; their views are level.
+    if a.has_views() || b.has_views() {
+        return judged(a, b, upright, options);
+    }
     if supported(&upright) >= FEW_CONSISTENT && !is_upside_down(&upright) {
         return judged(a, b, upright, options);
     }
@@ -326,8 +337,9 @@ fn judged(
     for (m, p) in estimate.points.iter().zip(&estimate.inliers) {
         let m = m.rescaled(scale);
         if relative.depths(&m).iter().all(|z| *z > 0.0) {
-            let u = m.a.extend(1.0).normalize();
-            let v = (cameras[1].rotation.transpose() * m.b.extend(1.0)).normalize();
+            let [a, b] = m.rays();
+            let u = a.normalize();
+            let v = (cameras[1].rotation.transpose() * b).normalize();
             let features =
                 vec![FeatureId { photo: 0, feature: p.a }, FeatureId { photo: 1, feature: p.b }];
             points.push(Point { position: midpoint([DVec3::ZERO, eye], [u, v]), features });
@@ -396,16 +408,16 @@ fn few_matches(consistent: usize, matches: usize) -> PoseRefusal {
 fn still(a: &PosePhoto, points: &[Bearings], scale: f64) -> Option<PoseRefusal> {
     let k = &a.lens.intrinsics;
     let px = f64::from(k.fx.min(k.fy)) * scale * REPORT_SIDE / k.width.max(k.height) as f64;
-    let shift_px = px * median(points.iter().map(|m| m.a.distance(m.b)).collect());
+    let shift = |m: &Bearings| match m.views {
+        None => m.a.distance(m.b),
+        Some(_) => m.shift(&DMat3::IDENTITY),
+    };
+    let shift_px = px * median(points.iter().map(shift).collect());
     if shift_px < SAME_VIEW_PX {
         return Some(PoseRefusal::SameView { shift_px });
     }
     let turn = best_rotation(points);
-    let parallax = |m: &Bearings| {
-        let p = turn * m.a.extend(1.0);
-        (p.truncate() / p.z).distance(m.b)
-    };
-    let parallax_px = px * median(points.iter().map(parallax).collect());
+    let parallax_px = px * median(points.iter().map(|m| m.shift(&turn)).collect());
     let degrees = super::two_view::rotation_angle(&turn).to_degrees();
     (parallax_px < MIN_PARALLAX_PX).then_some(PoseRefusal::PureRotation { degrees, parallax_px })
 }
@@ -434,7 +446,7 @@ fn mirrored(
 /// vectors, then again on the closer half of them. Source: W. Kabsch 1976.
 fn best_rotation(points: &[Bearings]) -> DMat3 {
     let unit: Vec<[DVec3; 2]> =
-        points.iter().map(|m| [m.a.extend(1.0).normalize(), m.b.extend(1.0).normalize()]).collect();
+        points.iter().map(|m| m.rays().map(|ray| ray.normalize())).collect();
     let mut rotation = DMat3::IDENTITY;
     let mut chosen: Vec<usize> = (0..unit.len()).collect();
     for _ in 0..6 {
@@ -552,7 +564,8 @@ fn written(
     for f in &point.features {
         let photo = photos[f.photo];
         let px = photo.in_photograph(photo.position(f.feature)).as_vec2();
-        if let Some(projected) = cameras[f.photo].and_then(|c| c.project(position)) {
+        let project = |camera: Camera| photo.project(&camera, f.feature, position);
+        if let Some(projected) = cameras[f.photo].and_then(project) {
             error += projected.distance(px);
         }
         observations.push((f.photo, px.to_array()));

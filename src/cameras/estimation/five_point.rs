@@ -133,7 +133,7 @@ pub(super) fn essential_matrices(sample: &[Bearings; 5]) -> Vec<DMat3> {
 fn null_space(sample: &[Bearings; 5]) -> Option<[[f64; 9]; 4]> {
     let mut found: Vec<[f64; 9]> = Vec::with_capacity(9);
     for m in sample {
-        let (a, b) = (m.a.extend(1.0).to_array(), m.b.extend(1.0).to_array());
+        let [a, b] = m.rays().map(|ray| ray.to_array());
         let row = std::array::from_fn(|i| b[i / 3] * a[i % 3]);
         // Nearly dependent equations determine no geometry.
         found.push(orthonormal(row, &found, 1e-9)?);

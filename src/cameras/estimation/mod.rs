@@ -4,6 +4,8 @@
 //! [`PoseEstimate`], or the reason why there is none ([`PoseRefusal`]). The module reads no files.
 //! Equal photographs give equal estimates.
 //!
+//! A panorama is a photograph of several views with one centre (`views.rs`).
+//!
 //! Cameras that are nearly right are adjusted by [`adjust_poses`] (`adjust.rs`).
 //!
 //! Two photographs: points are matched, an essential matrix is estimated and refined
@@ -25,6 +27,7 @@ mod reconstruct;
 mod refine;
 mod tracks;
 mod two_view;
+mod views;
 mod world;
 
 pub use adjust::{PoseAdjustment, adjust_poses, locate_photos, move_along};
@@ -33,3 +36,4 @@ pub use estimate::{
     PoseWarning, Uncertain, estimate_poses,
 };
 pub use photo::{Lens, PosePhoto, PosePhotoError};
+pub use views::PhotoView;

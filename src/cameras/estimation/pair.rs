@@ -13,12 +13,13 @@
 //! no evidence for it: the matches found before decide whether a pose is refused. `benches/README.md` has the
 //! report.
 
-use super::photo::{PosePhoto, aligned, detected, deviations};
+use super::photo::{PosePhoto, aligned, bearings, detected, deviations};
 use super::ransac;
 use super::refine::{FocalPrior, Refined, refine};
-use super::two_view::{Bearings, sampson};
+use super::two_view::{Bearings, Relative, sampson};
 use crate::cameras::matches::pairs;
 use crate::cameras::matches::pairs::Pair;
+use glam::DVec3;
 
 /// Largest residual of a right match, standard deviations.
 const LIMIT: f64 = 3.5;
@@ -209,8 +210,8 @@ impl PairEstimate {
     pub(super) fn angles(&self) -> Vec<f64> {
         let (r, s) = (self.refined.relative.rotation, self.refined.focal_scale);
         let angle = |m: &Bearings| {
-            let m = m.rescaled(s);
-            (r * m.a.extend(1.0)).angle_between(m.b.extend(1.0))
+            let [a, b] = m.rescaled(s).rays();
+            (r * a).angle_between(b)
         };
         self.points.iter().map(angle).collect()
     }
@@ -248,11 +249,15 @@ fn candidates(points: &[Bearings], prior: Option<FocalPrior>, seed: u64) -> Vec<
 
 /// Matches features along the epipolar lines of a pose, in front of both cameras.
 fn along_lines(a: &PosePhoto, b: &PosePhoto, r: &Refined) -> Vec<Pair> {
+    if a.has_views() || b.has_views() {
+        return along_circles(a, b, &r.relative);
+    }
     let e = r.relative.essential();
     let s = r.focal_scale;
     let deviation = 0.5 * (deviations(a)[0] + deviations(b)[0]);
-    let bearings =
-        |i: usize, j: usize| Bearings { a: a.bearings[i], b: b.bearings[j], deviation }.rescaled(s);
+    let bearings = |i: usize, j: usize| {
+        Bearings { a: a.bearings[i], b: b.bearings[j], deviation, views: None }.rescaled(s)
+    };
     // Bearings belong to the lens's focal length, the line to the estimated one.
     let near = |i: usize| {
         let line = e * (a.bearings[i] / s).extend(1.0);
@@ -269,5 +274,22 @@ fn along_lines(a: &PosePhoto, b: &PosePhoto, r: &Refined) -> Vec<Pair> {
     };
     let mut found = pairs::guided(&a.features, &b.features, near);
     found.retain(|p| r.relative.depths(&bearings(p.a, p.b)).iter().all(|z| *z > 0.0));
+    found
+}
+
+/// [`along_lines`] of photographs of several views, of which lenses are exact: lines are great circles.
+fn along_circles(a: &PosePhoto, b: &PosePhoto, relative: &Relative) -> Vec<Pair> {
+    let e = relative.essential();
+    let reach = 3.0 * LIMIT * 0.5 * (deviations(a)[0] + deviations(b)[0]);
+    let rays: Vec<DVec3> = (0..b.bearings.len()).map(|j| b.ray(j)).collect();
+    let (rays, e) = (&rays, &e);
+    let near = |i: usize| {
+        let normal = (*e * a.ray(i)).normalize_or_zero();
+        move |j: usize| {
+            normal.dot(rays[j]).abs() < reach && sampson(e, &bearings(a, b, i, j)).abs() < LIMIT
+        }
+    };
+    let mut found = pairs::guided(&a.features, &b.features, near);
+    found.retain(|p| relative.depths(&bearings(a, b, p.a, p.b)).iter().all(|z| *z > 0.0));
     found
 }

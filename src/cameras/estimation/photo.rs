@@ -7,7 +7,7 @@ use crate::cameras::matches::pairs::Pair;
 use crate::cameras::matches::{GrayImage, align};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
-use glam::DVec2;
+use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 use subsplat_kernels::camera::{CameraError, Intrinsics};
 
@@ -95,6 +95,9 @@ pub struct PosePhoto {
     pub(super) bearings: Vec<DVec2>,
     /// Colour at each feature.
     pub(super) colours: Vec<[u8; 3]>,
+    /// Rotations from the photograph's axes to those of its views, whose pictures lie side by side in `image`;
+    /// empty for a photograph that is one view ([`PosePhoto::from_views`]).
+    pub(super) views: Vec<DMat3>,
 }
 
 /// Longer side of the photographs in which points are matched, px.
@@ -158,8 +161,8 @@ impl PosePhoto {
         let image = if factor < 1.0 { image.reduced(side(w), side(h)) } else { image };
         let features = features::detect(&image, count, orientation);
         let working = lens.intrinsics.resized(image.width(), image.height());
-        let mut photo =
-            Self { image, features, lens, working, bearings: Vec::new(), colours: Vec::new() };
+        let (bearings, colours, views) = (Vec::new(), Vec::new(), Vec::new());
+        let mut photo = Self { image, features, lens, working, bearings, colours, views };
         let all = 0..photo.features.points.len();
         photo.bearings = all.map(|i| photo.bearing(photo.position(i))).collect();
         photo
@@ -206,8 +209,13 @@ impl PosePhoto {
     }
 
     /// The same photograph with a focal length `scale` times as long, which is then exact.
+    ///
+    /// Views of one photograph have known directions, so that their focal length stays as it is.
     pub(super) fn with_focal(&self, scale: f64) -> Self {
         let mut photo = self.clone();
+        if self.has_views() {
+            return photo;
+        }
         for k in [&mut photo.lens.intrinsics, &mut photo.working] {
             k.fx *= scale as f32;
             k.fy *= scale as f32;
@@ -227,8 +235,8 @@ impl PosePhoto {
     pub(super) fn in_photograph(&self, px: DVec2) -> DVec2 {
         let k = &self.lens.intrinsics;
         let scale = DVec2::new(
-            k.width as f64 / self.image.width() as f64,
-            k.height as f64 / self.image.height() as f64,
+            k.width as f64 / self.working.width as f64,
+            k.height as f64 / self.working.height as f64,
         );
         px * scale
     }
@@ -236,7 +244,8 @@ impl PosePhoto {
     /// Point on the plane z = 1 of a position of the working picture, px.
     pub(super) fn bearing(&self, px: DVec2) -> DVec2 {
         let k = &self.working;
-        let centred = px - DVec2::new(f64::from(k.cx), f64::from(k.cy));
+        let start = DVec2::new((self.view_at(px) * k.width) as f64, 0.0);
+        let centred = px - start - DVec2::new(f64::from(k.cx), f64::from(k.cy));
         centred / DVec2::new(f64::from(k.fx), f64::from(k.fy))
     }
 
@@ -266,9 +275,16 @@ pub(super) fn deviations(photo: &PosePhoto) -> [f64; 2] {
 
 /// Returns the matches of `found` as they were detected.
 pub(super) fn detected(a: &PosePhoto, b: &PosePhoto, found: &[Pair]) -> Vec<Bearings> {
+    found.iter().map(|p| bearings(a, b, p.a, p.b)).collect()
+}
+
+/// The match of feature `i` of `a` with feature `j` of `b`, as they were detected.
+pub(super) fn bearings(a: &PosePhoto, b: &PosePhoto, i: usize, j: usize) -> Bearings {
     let deviation = 0.5 * (deviations(a)[0] + deviations(b)[0]);
-    let one = |p: &Pair| Bearings { a: a.bearings[p.a], b: b.bearings[p.b], deviation };
-    found.iter().map(one).collect()
+    let (of_a, of_b) = (a.view_of(i), b.view_of(j));
+    let turn = |view: Option<DMat3>| view.unwrap_or(DMat3::IDENTITY);
+    let views = (of_a.is_some() || of_b.is_some()).then(|| [of_a, of_b].map(turn));
+    Bearings { a: a.bearings[i], b: b.bearings[j], deviation, views }
 }
 
 /// Returns the matches of `found` with the second point moved to where the surroundings of both

@@ -9,14 +9,14 @@
 //! Source: N. Snavely, S. Seitz and R. Szeliski, "Photo tourism", 2006; J. Schönberger and
 //! J.-M. Frahm, "Structure-from-motion revisited", 2016.
 
-use super::absolute::{Absolute, Sight, locate};
+use super::absolute::{Absolute, Sight, in_view, locate};
 use super::bundle::{Bundle, Observation};
 use super::groups::Groups;
 use super::pair::{self, PairEstimate};
 use super::photo::{PosePhoto, aligned_position, deviations};
 use super::refine::FocalPrior;
 use super::tracks::{FeatureId, tracks};
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
 /// Smallest number of matches of a verified pair.
@@ -367,7 +367,7 @@ impl<'a> Builder<'a> {
             let Some(position) = position else { continue };
             for (at, f) in self.tracks[track].iter().enumerate() {
                 let Some(camera) = self.cameras[f.photo] else { continue };
-                let p = camera.to_camera(*position);
+                let p = in_view(self.view(f), camera.to_camera(*position));
                 let (bearing, _) = self.sight(track, at);
                 let distance = (p.truncate() / p.z).distance(bearing);
                 all.push(distance * self.photos[f.photo].focal());
@@ -388,6 +388,11 @@ impl<'a> Builder<'a> {
         }
     }
 
+    /// See [`Sight::view`].
+    fn view(&self, f: &FeatureId) -> Option<DMat3> {
+        self.photos[f.photo].view_of(f.feature)
+    }
+
     /// The tracks' known points as photograph `photo` sees them, with their tracks.
     fn sights(&self, photo: usize) -> Vec<(usize, Sight)> {
         let scale = self.log_focal.exp();
@@ -396,7 +401,9 @@ impl<'a> Builder<'a> {
             let Some(point) = *position else { continue };
             if let Some(at) = self.tracks[track].iter().position(|f| f.photo == photo) {
                 let (bearing, deviation) = self.sight(track, at);
-                let sight = Sight { point, bearing: bearing / scale, deviation: deviation / scale };
+                let view = self.view(&self.tracks[track][at]);
+                let (bearing, deviation) = (bearing / scale, deviation / scale);
+                let sight = Sight { point, bearing, deviation, view };
                 out.push((track, sight));
             }
         }
@@ -438,26 +445,20 @@ impl<'a> Builder<'a> {
         for (at, f) in self.tracks[track].iter().enumerate() {
             if let Some(camera) = self.cameras[f.photo] {
                 let (bearing, deviation) = self.sight(track, at);
-                rays.push((*f, camera, bearing / scale, deviation / scale));
+                let (bearing, deviation) = (bearing / scale, deviation / scale);
+                rays.push(Ray { feature: *f, camera, bearing, deviation, view: self.view(f) });
             }
         }
-        let direction =
-            |c: &Absolute, b: &DVec2| (c.rotation.transpose() * b.extend(1.0)).normalize();
-        let residual = |c: &Absolute, b: DVec2, dev: f64, p: DVec3| {
-            let q = c.to_camera(p);
-            if q.z > 1e-9 { (q.truncate() / q.z).distance(b) / dev } else { f64::INFINITY }
-        };
         // Of the points of all pairs of rays the one with which most rays agree.
         let mut best: (usize, Option<DVec3>) = (1, None);
         for i in 0..rays.len() {
             for j in i + 1..rays.len() {
-                let (u, v) = (direction(&rays[i].1, &rays[i].2), direction(&rays[j].1, &rays[j].2));
+                let (u, v) = (rays[i].direction(), rays[j].direction());
                 if u.angle_between(v) < MIN_ANGLE {
                     continue;
                 }
-                let p = midpoint([rays[i].1.position(), rays[j].1.position()], [u, v]);
-                let count =
-                    rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, p) < self.limit).count();
+                let p = midpoint([rays[i].camera.position(), rays[j].camera.position()], [u, v]);
+                let count = rays.iter().filter(|ray| ray.residual(p) < self.limit).count();
                 if count > best.0 {
                     best = (count, Some(p));
                 }
@@ -469,17 +470,13 @@ impl<'a> Builder<'a> {
         let Some(mut p) = best.1 else { return (None, Vec::new()) };
         // A point that was adjusted before keeps its place where as many rays agree with it.
         if let Some(old) = self.positions[track] {
-            let count =
-                rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, old) < self.limit).count();
+            let count = rays.iter().filter(|ray| ray.residual(old) < self.limit).count();
             if count >= best.0 {
                 p = old;
             }
         }
-        let agreeing = rays
-            .iter()
-            .filter(|(_, c, b, d)| residual(c, *b, *d, p) < self.limit)
-            .map(|r| r.0)
-            .collect();
+        let agreeing =
+            rays.iter().filter(|ray| ray.residual(p) < self.limit).map(|ray| ray.feature).collect();
         (Some(p), agreeing)
     }
 
@@ -508,7 +505,8 @@ impl<'a> Builder<'a> {
                 if self.agreeing[track].contains(f) {
                     let (bearing, deviation) = self.sight(track, at);
                     let point = points.len();
-                    observations.push(Observation { camera, point, bearing, deviation });
+                    let view = self.view(f);
+                    observations.push(Observation { camera, point, bearing, deviation, view });
                 }
             }
             points.push(*position);
@@ -573,6 +571,32 @@ impl<'a> Builder<'a> {
             rotation_deviation: rotation,
             position_deviation: position,
         }
+    }
+}
+
+/// A feature of a track, seen from its camera.
+struct Ray {
+    feature: FeatureId,
+    camera: Absolute,
+    bearing: DVec2,
+    deviation: f64,
+    /// See [`Sight::view`].
+    view: Option<DMat3>,
+}
+
+impl Ray {
+    /// Direction in the world, of unit length.
+    fn direction(&self) -> DVec3 {
+        let ray = self.bearing.extend(1.0);
+        let ray = self.view.map_or(ray, |view| view.transpose() * ray);
+        (self.camera.rotation.transpose() * ray).normalize()
+    }
+
+    /// Distance of the feature from the projection of a point, standard deviations.
+    fn residual(&self, point: DVec3) -> f64 {
+        let p = in_view(self.view, self.camera.to_camera(point));
+        let distance = || (p.truncate() / p.z).distance(self.bearing) / self.deviation;
+        if p.z > 1e-9 { distance() } else { f64::INFINITY }
     }
 }
 

@@ -13,6 +13,9 @@ pub(super) struct Bearings {
     pub b: DVec2,
     /// Standard deviation of the distance to the epipolar geometry, units of the planes.
     pub deviation: f64,
+    /// Rotations from the axes of both cameras to those of the views whose planes have the points: of cameras
+    /// with several views ([`super::photo::PosePhoto::from_views`]). `None` for the cameras' own planes.
+    pub views: Option<[DMat3; 2]>,
 }
 
 /// Relative pose: x_b = R·x_a + t with |t| = 1.
@@ -53,7 +56,30 @@ pub(super) fn rotation_angle(r: &DMat3) -> f64 {
 impl Bearings {
     /// Returns the match for focal lengths `s` times as long.
     pub(super) fn rescaled(&self, s: f64) -> Self {
-        Self { a: self.a / s, b: self.b / s, deviation: self.deviation / s }
+        Self { a: self.a / s, b: self.b / s, deviation: self.deviation / s, views: self.views }
+    }
+
+    /// Returns the directions of both points in the axes of their cameras, of any length.
+    pub(super) fn rays(&self) -> [DVec3; 2] {
+        let rays = [self.a.extend(1.0), self.b.extend(1.0)];
+        match &self.views {
+            None => rays,
+            Some([a, b]) => [a.transpose() * rays[0], b.transpose() * rays[1]],
+        }
+    }
+
+    /// Distance between the second point and the first one turned by `rotation`, units of the plane; infinite
+    /// where that direction lies behind the second point's view.
+    pub(super) fn shift(&self, rotation: &DMat3) -> f64 {
+        let seen = *rotation * self.rays()[0];
+        match &self.views {
+            None => (seen.truncate() / seen.z).distance(self.b),
+            Some([_, view]) => {
+                let seen = *view * seen;
+                let front = seen.z > 1e-9;
+                if front { (seen.truncate() / seen.z).distance(self.b) } else { f64::INFINITY }
+            }
+        }
     }
 }
 
@@ -72,6 +98,12 @@ impl Relative {
 
     /// Depths (camera z, in baselines) at which the two rays of a match are closest.
     pub(super) fn depths(&self, m: &Bearings) -> [f64; 2] {
+        // The pose of a view against another one has the same translation, in that view's axes.
+        if let Some([a, b]) = &m.views {
+            let rotation = *b * self.rotation * a.transpose();
+            let between = Self { rotation, translation: *b * self.translation };
+            return between.depths(&Bearings { views: None, ..*m });
+        }
         let a = self.rotation * m.a.extend(1.0);
         let b = m.b.extend(1.0);
         let normal = a.cross(b);
@@ -125,6 +157,14 @@ impl Relative {
 /// distance is the first-order distance of both points to the nearest pair that satisfies
 /// x_bᵀ E x_a = 0.
 pub(super) fn sampson(e: &DMat3, m: &Bearings) -> f64 {
+    match &m.views {
+        None => sampson_on_planes(e, m),
+        // The essential matrix between the two views.
+        Some([a, b]) => sampson_on_planes(&(*b * *e * a.transpose()), m),
+    }
+}
+
+fn sampson_on_planes(e: &DMat3, m: &Bearings) -> f64 {
     let (a, b) = (m.a.extend(1.0), m.b.extend(1.0));
     let line_b = *e * a;
     let line_a = DVec2::new(e.x_axis.dot(b), e.y_axis.dot(b));
@@ -159,7 +199,8 @@ pub(super) mod tests {
             if b.z > 0.5 {
                 let mut jitter = || noise * DVec2::new(random.normal(), random.normal());
                 let b = b.truncate() / b.z + jitter();
-                points.push(Bearings { a: a + jitter(), b, deviation: noise.max(1e-3) });
+                let deviation = noise.max(1e-3);
+                points.push(Bearings { a: a + jitter(), b, deviation, views: None });
             }
         }
         (relative, points)

@@ -66,6 +66,17 @@ impl GrayImage {
         rgb.len().is_multiple_of(3).then(|| Self::new(width, height, grey.collect()))?
     }
 
+    /// Pictures of one height side by side, without masks; `None` for others, and for none.
+    pub(crate) fn side_by_side(pictures: &[Self]) -> Option<Self> {
+        let height = pictures.first()?.height;
+        if pictures.iter().any(|picture| picture.height != height) {
+            return None;
+        }
+        let rows = (0..height).flat_map(|y| pictures.iter().flat_map(move |p| p.row(y)));
+        let width = pictures.iter().map(Self::width).sum();
+        Self::new(width, height, rows.copied().collect())
+    }
+
     /// Returns the width, px.
     pub fn width(&self) -> usize {
         self.width

@@ -11,4 +11,6 @@ pub(in crate::files) mod masks;
 pub mod photograph;
 pub mod resize;
 mod rgb_image;
+pub mod shape;
 pub mod undistort;
+pub mod views;

@@ -47,6 +47,8 @@ pub struct PhotographHeader {
     pub orientation: Option<u8>,
     /// The camera of the EXIF block. Its focal length is in px of `width` × `height`.
     pub camera: ExifCamera,
+    /// The metadata state an equirectangular panorama, which has no focal length.
+    pub panorama: bool,
     /// Warnings for the user, one line each, with the file's path.
     pub warnings: Vec<String>,
 }
@@ -111,19 +113,61 @@ pub fn probe_photograph(path: impl AsRef<Path>) -> Result<PhotographHeader> {
     let Header { probe, exif, panorama } = decode::header(path)?;
     let orientation = probe.orientation;
     let Probe { width, height, .. } = probe.upright();
-    let ExifReport { camera, warnings, .. } =
-        report(exif.as_deref(), panorama, width, height, path)?;
-    Ok(PhotographHeader { width, height, orientation, camera, warnings })
+    let ExifReport { mut camera, mut warnings, .. } = report(exif.as_deref(), width, height, path)?;
+    if panorama {
+        camera.focal = None;
+    } else {
+        warnings.extend(panorama_shape(&camera, width, height, path));
+    }
+    Ok(PhotographHeader { width, height, orientation, camera, panorama, warnings })
 }
 
 /// Decodes a photograph with its mask and turns it upright. A mask file that is missing, cannot be read or has
 /// another shape gives a warning.
 ///
 /// # Errors
-/// Those of [`super::image::load_with`]; a DNG raw file; a photograph that is masked entirely.
+/// Those of [`super::image::load_with`]; a DNG raw file; a photograph that is masked entirely; a panorama, by
+/// its metadata.
 pub fn load_photograph(path: impl AsRef<Path>, options: &LoadOptions) -> Result<Photograph> {
     let path = path.as_ref();
+    let mask = masks::of_photograph(path);
+    no_panorama(decode_upright(&read(path)?, options, path, mask.as_deref())?, path)
+}
+
+/// A photograph with what the file says of its projection.
+pub(crate) type PhotographOrPanorama = (Photograph, bool);
+
+/// [`load_photograph`] of photographs and panoramas; `true` for a panorama by its metadata. There is no warning
+/// of the shape of a panorama.
+///
+/// # Errors
+/// Those of [`load_photograph`] but for panoramas.
+pub(crate) fn load_photograph_or_panorama(
+    path: &Path,
+    options: &LoadOptions,
+) -> Result<PhotographOrPanorama> {
     decode_upright(&read(path)?, options, path, masks::of_photograph(path).as_deref())
+}
+
+/// The photograph with a warning of the shape of a panorama.
+///
+/// # Errors
+/// A panorama by its metadata.
+fn no_panorama(
+    (mut photograph, panorama): PhotographOrPanorama,
+    path: &Path,
+) -> Result<Photograph> {
+    if panorama {
+        return Err(Error::format(
+            path,
+            "a photograph with straight lines",
+            "a panorama (equirectangular), which cannot have given cameras here: leave them out so that they are \
+             estimated, or give transforms.json with camera_model EQUIRECTANGULAR",
+        ));
+    }
+    let Rgb { width, height, .. } = photograph.image;
+    photograph.warnings.extend(panorama_shape(&photograph.camera, width, height, path));
+    Ok(photograph)
 }
 
 /// Decodes bytes in memory as [`load_photograph`] does, without a mask file; `path` is for messages.
@@ -135,7 +179,8 @@ pub fn parse_photograph(
     options: &LoadOptions,
     path: impl AsRef<Path>,
 ) -> Result<Photograph> {
-    decode_upright(bytes, options, path.as_ref(), None)
+    let path = path.as_ref();
+    no_panorama(decode_upright(bytes, options, path, None)?, path)
 }
 
 fn decode_upright(
@@ -143,10 +188,13 @@ fn decode_upright(
     options: &LoadOptions,
     path: &Path,
     mask_file: Option<&Path>,
-) -> Result<Photograph> {
+) -> Result<PhotographOrPanorama> {
     let decoded = decode(bytes, options, path)?;
     let Rgb { width, height, .. } = decoded.picture;
-    let report = report(decoded.exif.as_deref(), decoded.panorama, width, height, path)?;
+    let mut report = report(decoded.exif.as_deref(), width, height, path)?;
+    if decoded.panorama {
+        report.camera.focal = None;
+    }
     let image = upright(decoded.picture, decoded.orientation)?;
     let orientation = Some(decoded.orientation.to_exif()).filter(|o| *o > 1);
     let mut warnings = decoded.warnings;
@@ -165,7 +213,8 @@ fn decode_upright(
         None => Some(mask),
     });
     let mask = masks::checked(mask, path)?;
-    Ok(Photograph { image, mask, orientation, camera: report.camera, warnings })
+    let camera = report.camera;
+    Ok((Photograph { image, mask, orientation, camera, warnings }, decoded.panorama))
 }
 
 /// Applies an EXIF orientation.
@@ -181,35 +230,31 @@ fn upright(picture: Rgb, orientation: Orientation) -> Result<Rgb> {
 /// Least width of a picture that may be a panorama, px.
 const PANORAMA_MIN: usize = 1000;
 
-/// Reads the EXIF block and adds the path to its warnings. A panorama, of which `panorama` says that the file
-/// states it, has no focal length and is refused.
-fn report(
-    block: Option<&[u8]>,
-    panorama: bool,
+/// A warning of the shape of a panorama, of a photograph whose focal length is not known.
+pub(crate) fn panorama_shape(
+    camera: &ExifCamera,
     width: usize,
     height: usize,
     path: &Path,
-) -> Result<ExifReport> {
-    if panorama {
-        return Err(Error::format(
-            path,
-            "a photograph with straight lines",
-            "a panorama (equirectangular): save pictures of it that are 90 degrees wide, as panorama programs \
-             do, and give these with --fov 90",
-        ));
-    }
+) -> Option<String> {
+    let panorama = width == 2 * height && width >= PANORAMA_MIN && camera.focal.is_none();
+    panorama.then(|| {
+        format!(
+            "{}: {width}x{height} pixels are the shape of a panorama, but nothing else says so: it is read as a \
+             photograph; --lens panorama reads it as a panorama",
+            path.display()
+        )
+    })
+}
+
+/// Reads the EXIF block and adds the path to its warnings.
+fn report(block: Option<&[u8]>, width: usize, height: usize, path: &Path) -> Result<ExifReport> {
     let mut report = block.map(|b| parse_exif(b, width, height)).unwrap_or_default();
     if report.raw {
         return Err(Error::format(
             path,
             "a developed photograph (JPEG, HEIC, PNG, TIFF)",
             "a DNG raw file (develop it to JPEG first)",
-        ));
-    }
-    if width == 2 * height && width >= PANORAMA_MIN && report.camera.focal.is_none() {
-        report.warnings.push(format!(
-            "{width}x{height} pixels are the shape of a panorama, which is read wrongly as a photograph: save \
-             pictures of it that are 90 degrees wide"
         ));
     }
     for warning in &mut report.warnings {

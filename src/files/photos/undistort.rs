@@ -5,7 +5,18 @@
 //!
 //! * Brown: x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶)
 //!   + 2 p1 x y + p2 (r² + 2x²), and y' alike with p1, p2 exchanged;
-//! * Fisheye: (x', y') = (x, y)·θ_d/r, θ = atan r, θ_d = θ(1 + k1 θ² + … + k4 θ⁸).
+//! * Fisheye: (x', y') = (x, y)·θ_d/r, θ = atan r, θ_d = θ(1 + k1 θ² + … + k4 θ⁸);
+//! * ThinPrismFisheye: (u, v) = (x, y)·θ/r with ρ² = u² + v², then x' = u(1 + k1 ρ² + … + k4 ρ⁸)
+//!   + 2 p1 u v + p2 (ρ² + 2u²) + s1 ρ², and y' alike with p1, p2 exchanged and s2 (J. Weng et al. 1992);
+//! * RadTanThinPrismFisheye: (a, b) = (u, v)(1 + k1 ρ² + … + k6 ρ¹²), R² = a² + b², then
+//!   x' = a + 2 p2 a b + p1 (R² + 2a²) + s1 R² + s2 R⁴, and y' alike with p1, p2 exchanged and s3, s4
+//!   (Project Aria, "Camera intrinsic models", Fisheye624);
+//! * Fov: (x', y') = (x, y)·atan(2 r tan(ω/2))/(r ω) (F. Devernay and O. Faugeras 2001);
+//! * Division: (x', y') = (x, y)·2/(1 + √(1 − 4 k r²)) (A. Fitzgibbon 2001);
+//! * Equirectangular: x' = atan2(x, z), y' = atan(y/√(x² + z²)): longitude and latitude.
+//!
+//! Fisheye lenses and panoramas project directions beside and behind the camera as well
+//! ([`Distortion::project`]); pinhole views of them are cut out in `views.rs`.
 //!
 //! The undistorted picture has the stored size and principal point. Both focal lengths are
 //! multiplied by the smallest factor for which every pixel lies inside the photograph: the
@@ -14,8 +25,9 @@
 
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
-use glam::{DVec2, Vec2};
+use glam::{DVec2, DVec3, Vec2};
 use rayon::prelude::*;
+use std::f64::consts::PI;
 use subsplat_kernels::camera::Intrinsics;
 
 /// A model of lens distortion.
@@ -37,6 +49,37 @@ pub enum Distortion {
         /// k1 to k4.
         k: [f64; 4],
     },
+    /// Fisheye with tangential distortion and a thin prism: COLMAP's THIN_PRISM_FISHEYE.
+    ThinPrismFisheye {
+        /// k1 to k4.
+        k: [f64; 4],
+        /// p1, p2.
+        p: [f64; 2],
+        /// s1, s2.
+        s: [f64; 2],
+    },
+    /// The same with more terms: COLMAP's RAD_TAN_THIN_PRISM_FISHEYE.
+    RadTanThinPrismFisheye {
+        /// k1 to k6.
+        k: [f64; 6],
+        /// p1, p2.
+        p: [f64; 2],
+        /// s1 to s4.
+        s: [f64; 4],
+    },
+    /// COLMAP's FOV.
+    Fov {
+        /// Angle ω, radians.
+        omega: f64,
+    },
+    /// COLMAP's SIMPLE_DIVISION and DIVISION.
+    Division {
+        /// k.
+        k: f64,
+    },
+    /// A panorama of 360° by 180°, or a part of one. The focal length is px per radian, the principal point lies
+    /// straight ahead.
+    Equirectangular,
 }
 
 impl Distortion {
@@ -56,6 +99,13 @@ impl Distortion {
             Self::None => true,
             Self::Brown { k, p } => k.iter().chain(p).all(|v| v.is_finite()),
             Self::Fisheye { k } => k.iter().all(|v| v.is_finite()),
+            Self::ThinPrismFisheye { k, p, s } => k.iter().chain(p).chain(s).all(|v| v.is_finite()),
+            Self::RadTanThinPrismFisheye { k, p, s } => {
+                k.iter().chain(p).chain(s).all(|v| v.is_finite())
+            }
+            Self::Fov { omega } => omega.abs() < PI,
+            Self::Division { k } => k.is_finite(),
+            Self::Equirectangular => true,
         };
         if finite { Ok(()) } else { Err(format!("{self:?}")) }
     }
@@ -66,19 +116,64 @@ impl Distortion {
     }
 
     fn distort_f64(&self, ray: DVec2) -> DVec2 {
-        let DVec2 { x, y } = ray;
         let r2 = ray.length_squared();
         match *self {
             Self::None => ray,
-            Self::Brown { p, .. } => {
-                let xy = 2.0 * x * y;
-                let tangential = DVec2::new(
-                    p[0] * xy + p[1] * (r2 + 2.0 * x * x),
-                    p[1] * xy + p[0] * (r2 + 2.0 * y * y),
-                );
-                ray * self.radial(r2) + tangential
+            Self::Brown { p, .. } => ray * self.radial(r2) + tangential(ray, p),
+            Self::Fisheye { .. } | Self::Fov { .. } | Self::Division { .. } => {
+                ray * self.radial(r2)
             }
-            Self::Fisheye { .. } => ray * self.radial(r2),
+            Self::ThinPrismFisheye { .. } | Self::RadTanThinPrismFisheye { .. } => {
+                let r = r2.sqrt();
+                self.bent(ray * if r < 1e-9 { 1.0 } else { r.atan() / r })
+            }
+            Self::Equirectangular => longitude_latitude(ray.extend(1.0)),
+        }
+    }
+
+    /// Projects a direction of the lens's axes, of any length, to its distorted position on the plane z = 1.
+    /// Fisheye lenses see directions of up to 180° from their axis, panoramas all, other lenses those in front.
+    /// `None` where the lens does not see the direction.
+    pub fn project(&self, direction: DVec3) -> Option<DVec2> {
+        let DVec3 { x, y, z } = direction;
+        let theta = || {
+            let r = x.hypot(y);
+            let theta = r.atan2(z);
+            // Straight behind, no direction in the picture is right.
+            let scale = if r < 1e-9 * z.abs() { 1.0 / z } else { theta / r };
+            (r > 0.0 || z > 0.0).then_some(DVec2::new(x, y) * scale)
+        };
+        match *self {
+            Self::Equirectangular => Some(longitude_latitude(direction)),
+            Self::Fisheye { k } => {
+                let uv = theta()?;
+                let t2 = uv.length_squared();
+                Some(uv * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))))
+            }
+            Self::ThinPrismFisheye { .. } | Self::RadTanThinPrismFisheye { .. } => {
+                Some(self.bent(theta()?))
+            }
+            _ if z > 0.0 => Some(self.distort_f64(DVec2::new(x, y) / z)),
+            _ => None,
+        }
+    }
+
+    /// Applies the terms of the thin-prism models to a direction (u, v) of length θ.
+    fn bent(&self, uv: DVec2) -> DVec2 {
+        let t2 = uv.length_squared();
+        match *self {
+            Self::ThinPrismFisheye { k, p, s } => {
+                let radial = 1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])));
+                uv * radial + tangential(uv, p) + DVec2::from(s) * t2
+            }
+            Self::RadTanThinPrismFisheye { k, p, s } => {
+                let radial = k.iter().rev().fold(0.0, |sum, k| (sum + k) * t2);
+                let ab = uv * (1.0 + radial);
+                let r2 = ab.length_squared();
+                let prism = DVec2::new(r2 * (s[0] + r2 * s[1]), r2 * (s[2] + r2 * s[3]));
+                ab + tangential(ab, [p[1], p[0]]) + prism
+            }
+            _ => uv,
         }
     }
 
@@ -100,6 +195,30 @@ impl Distortion {
                 let t2 = theta * theta;
                 theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))) / r
             }
+            Self::ThinPrismFisheye { k, .. } => Self::Fisheye { k }.radial(r2),
+            Self::RadTanThinPrismFisheye { k, .. } => {
+                let r = r2.sqrt();
+                if r < 1e-9 {
+                    return 1.0;
+                }
+                let t2 = r.atan().powi(2);
+                r.atan() * (1.0 + k.iter().rev().fold(0.0, |sum, k| (sum + k) * t2)) / r
+            }
+            Self::Fov { omega } => {
+                let r = r2.sqrt();
+                let slope = 2.0 * (0.5 * omega).tan();
+                // The limit of a small angle is a pinhole.
+                if omega.abs() < 1e-6 {
+                    1.0
+                } else if r * slope.abs() < 1e-6 {
+                    slope / omega
+                } else {
+                    (r * slope).atan() / (r * omega)
+                }
+            }
+            // A root of a negative number is NaN: the lens does not see the ray.
+            Self::Division { k } => 2.0 / (1.0 + (1.0 - 4.0 * k * r2).sqrt()),
+            Self::Equirectangular => 1.0,
         }
     }
 
@@ -118,6 +237,19 @@ impl Distortion {
         }
         limit
     }
+}
+
+/// Tangential distortion of OpenCV at a point.
+fn tangential(at: DVec2, p: [f64; 2]) -> DVec2 {
+    let DVec2 { x, y } = at;
+    let (r2, xy) = (at.length_squared(), 2.0 * x * y);
+    DVec2::new(p[0] * xy + p[1] * (r2 + 2.0 * x * x), p[1] * xy + p[0] * (r2 + 2.0 * y * y))
+}
+
+/// Longitude, to the right, and latitude, down, of a direction, radians.
+fn longitude_latitude(direction: DVec3) -> DVec2 {
+    let DVec3 { x, y, z } = direction;
+    DVec2::new(x.atan2(z), y.atan2(x.hypot(z)))
 }
 
 /// Range of the focal factor. Below ½, the middle would have a quarter of its pixels; above
@@ -170,14 +302,15 @@ pub fn pinhole(k: &Intrinsics, distortion: &Distortion) -> Result<Intrinsics, St
 }
 
 /// Iterates over the centres of the pixels along the picture's edge.
-fn border(k: &Intrinsics) -> impl Iterator<Item = DVec2> {
+pub(super) fn border(k: &Intrinsics) -> impl Iterator<Item = DVec2> {
     let (w, h) = (k.width, k.height);
     let rows = (0..w).flat_map(move |x| [(x, 0), (x, h - 1)]);
     let columns = (0..h).flat_map(move |y| [(0, y), (w - 1, y)]);
     rows.chain(columns).map(|(x, y)| DVec2::new(x as f64 + 0.5, y as f64 + 0.5))
 }
 
-fn ray(k: &Intrinsics, px: DVec2) -> DVec2 {
+/// The ray (x, y, 1) of a pixel position, without its z.
+pub(super) fn ray(k: &Intrinsics, px: DVec2) -> DVec2 {
     DVec2::new(
         (px.x - f64::from(k.cx)) / f64::from(k.fx),
         (px.y - f64::from(k.cy)) / f64::from(k.fy),
@@ -187,18 +320,7 @@ fn ray(k: &Intrinsics, px: DVec2) -> DVec2 {
 /// Resamples the photograph of a lens with `distortion` and intrinsics `from` to the pinhole
 /// `to`.
 pub fn undistort(photo: &Rgb, from: &Intrinsics, distortion: &Distortion, to: &Intrinsics) -> Rgb {
-    let mut out = Rgb::black(to.width, to.height);
-    if out.data.is_empty() || photo.data.is_empty() {
-        return out;
-    }
-    out.data.par_chunks_mut(3 * to.width).enumerate().for_each(|(y, line)| {
-        for (x, pixel) in line.chunks_exact_mut(3).enumerate() {
-            let px = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
-            let [u, v] = source(px, from, distortion, to);
-            pixel.copy_from_slice(&sample(photo, u as f32, v as f32));
-        }
-    });
-    out
+    resample(photo, to, Edge::Clamped, |px| Some(source(px, from, distortion, to)))
 }
 
 /// [`undistort`] of a photograph with a mask of its pixels. A pixel has the mask of the photograph's pixel at
@@ -211,19 +333,63 @@ pub fn undistort_masked(
     distortion: &Distortion,
     to: &Intrinsics,
 ) -> (Rgb, Option<Mask>) {
-    let mut out = undistort(photo, from, distortion, to);
+    let source = |px| Some(source(px, from, distortion, to));
+    resample_masked(photo, mask, to, Edge::Clamped, source)
+}
+
+/// Pixels beside the left and the right edge of a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Edge {
+    /// Those of the edge.
+    Clamped,
+    /// Those of the other edge: a panorama.
+    Wrapped,
+}
+
+/// Samples `photo` at the places that `source` gives for the pixels of a picture of the size of `to`; black where
+/// there is none.
+pub(super) fn resample(
+    photo: &Rgb,
+    to: &Intrinsics,
+    edge: Edge,
+    source: impl Fn(DVec2) -> Option<[f64; 2]> + Sync,
+) -> Rgb {
+    let mut out = Rgb::black(to.width, to.height);
+    if out.data.is_empty() || photo.data.is_empty() {
+        return out;
+    }
+    out.data.par_chunks_mut(3 * to.width).enumerate().for_each(|(y, line)| {
+        for (x, pixel) in line.chunks_exact_mut(3).enumerate() {
+            let px = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+            if let Some([u, v]) = source(px) {
+                pixel.copy_from_slice(&sample(photo, u as f32, v as f32, edge));
+            }
+        }
+    });
+    out
+}
+
+/// [`resample`] with a mask, as [`undistort_masked`].
+pub(super) fn resample_masked(
+    photo: &Rgb,
+    mask: &Mask,
+    to: &Intrinsics,
+    edge: Edge,
+    source: impl Fn(DVec2) -> Option<[f64; 2]> + Sync,
+) -> (Rgb, Option<Mask>) {
+    let mut out = resample(photo, to, edge, &source);
     if !mask.fits(photo) {
         return (out, None);
     }
     let at = |i: usize| {
         let px = DVec2::new((i % to.width) as f64 + 0.5, (i / to.width) as f64 + 0.5);
-        let [u, v] = source(px, from, distortion, to);
+        let Some([u, v]) = source(px) else { return false };
         // `as` saturates: any position gives a valid index.
         let (x, y) = ((u as usize).min(mask.width() - 1), (v as usize).min(mask.height() - 1));
         mask.kept()[y * mask.width() + x]
     };
     let kept: Vec<bool> = (0..to.width * to.height).into_par_iter().map(at).collect();
-    let clean = undistort(&mask.filled(photo), from, distortion, to);
+    let clean = resample(&mask.filled(photo), to, edge, &source);
     let pixels = out.data.chunks_exact_mut(3).zip(clean.data.chunks_exact(3));
     for ((pixel, clean), _) in pixels.zip(&kept).filter(|(_, kept)| **kept) {
         pixel.copy_from_slice(clean);
@@ -252,19 +418,22 @@ fn cubic(t: f32) -> [f32; 4] {
     ]
 }
 
-/// Samples bicubically at pixel position (u, v), clamped at the edge.
-fn sample(photo: &Rgb, u: f32, v: f32) -> [u8; 3] {
+/// Samples bicubically at pixel position (u, v), clamped at the upper and the lower edge.
+fn sample(photo: &Rgb, u: f32, v: f32, edge: Edge) -> [u8; 3] {
     let (u, v) = (u - 0.5, v - 0.5);
     let (x0, y0) = (u.floor(), v.floor());
     let (wx, wy) = (cubic(u - x0), cubic(v - y0));
     // `as` saturates: any position gives a valid index.
-
     let at = |i: f32, n: usize| (i.max(0.0) as usize).min(n - 1);
+    let column = |i: f32| match edge {
+        Edge::Clamped => at(i, photo.width),
+        Edge::Wrapped => at(i.rem_euclid(photo.width as f32), photo.width),
+    };
     let mut sum = [0.0f32; 3];
     for (j, wy) in wy.into_iter().enumerate() {
         let row = at(y0 + j as f32 - 1.0, photo.height) * photo.width;
         for (i, wx) in wx.into_iter().enumerate() {
-            let p = 3 * (row + at(x0 + i as f32 - 1.0, photo.width));
+            let p = 3 * (row + column(x0 + i as f32 - 1.0));
             for (s, v) in sum.iter_mut().zip(&photo.data[p..p + 3]) {
                 *s += wx * wy * f32::from(*v);
             }
@@ -286,6 +455,18 @@ mod tests {
             Distortion::brown([0.15, 0.0, 0.01, 0.0, 0.0, 0.0], [0.0, 0.0]),
             Distortion::brown([0.3, 0.1, 0.0, 0.5, 0.05, 0.0], [0.0, 0.0]),
             Distortion::fisheye([0.02, -0.01, 0.0, 0.0]),
+            Distortion::Fov { omega: 0.9 },
+            Distortion::Division { k: -0.15 },
+            Distortion::ThinPrismFisheye {
+                k: [0.02, -0.01, 0.005, -0.002],
+                p: [0.003, -0.004],
+                s: [0.001, -0.002],
+            },
+            Distortion::RadTanThinPrismFisheye {
+                k: [0.02, -0.01, 0.005, -0.002, 0.001, -0.0005],
+                p: [0.003, -0.004],
+                s: [0.001, -0.002, 0.0015, 0.0005],
+            },
         ]
     }
 

@@ -1,6 +1,7 @@
 //! Common parts of the pose readers: search for pictures, reading of their headers, and
 //! conversion of a file's entries to checked [`Frame`]s.
 
+use super::panoramas::{self, DraftView};
 use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
 use crate::files::photos::image::{Probe, probe};
 use crate::files::photos::masks;
@@ -40,8 +41,10 @@ pub(super) struct Draft {
     pub size: Option<(usize, usize)>,
     /// OpenCV pose.
     pub world_from_camera: DMat4,
-    /// See [`Frame`].
+    /// See [`Frame`]. A panorama becomes several frames ([`panoramas`]).
     pub distortion: Distortion,
+    /// View of the picture that is the frame; `None` for the whole picture.
+    pub view: Option<DraftView>,
     /// See [`Frame`].
     pub timestamp: Option<i64>,
     /// See [`Frame`].
@@ -64,6 +67,7 @@ impl Draft {
             size: None,
             world_from_camera,
             distortion: Distortion::None,
+            view: None,
             timestamp: None,
             depth: None,
             mask: None,
@@ -328,10 +332,11 @@ pub(super) fn assemble(
         _ => None,
     };
     let probes: Vec<Option<Result<Probe>>> = drafts.par_iter().map(probe).collect();
-    let count = drafts.len();
+    let entries = panoramas::expanded(path, drafts.into_iter().zip(probes).collect());
+    let count = entries.len();
     let mut notes = Notes::default();
     let mut frames: Vec<Frame> = Vec::with_capacity(count);
-    for (mut draft, stored) in drafts.into_iter().zip(probes) {
+    for (mut draft, stored) in entries {
         let file = draft.file.clone();
         let made = match (draft.refused.take(), stored) {
             (Some(error), _) | (None, Some(Err(error))) => Err(error),
@@ -429,7 +434,7 @@ fn size(image: &Path, pixels: Pixels) -> Result<Probe> {
 
 fn frame(
     path: &Path,
-    draft: Draft,
+    mut draft: Draft,
     image: PathBuf,
     stored: &Probe,
     notes: &mut Notes,
@@ -441,7 +446,14 @@ fn frame(
         notes.with_orientation.push(draft.file.clone());
     }
     let mut other_shape = None;
-    let StoredIntrinsics { intrinsics, rescaled } = match stored_intrinsics(&draft, stored) {
+    let view = draft.view.take();
+    let found = match &view {
+        Some(view) => {
+            Ok(StoredIntrinsics { intrinsics: view_intrinsics(&draft, view), rescaled: false })
+        }
+        None => stored_intrinsics(&draft, stored),
+    };
+    let StoredIntrinsics { intrinsics, rescaled } = match found {
         Ok(k) => k,
         Err(misfit) => {
             let Misfit { intrinsics, got } = misfit;
@@ -470,18 +482,32 @@ fn frame(
         return bad("finite distortion coefficients".to_owned(), e);
     }
     let mask = mask(&draft, &image, stored, notes);
+    let label = view.as_ref().map_or("", |view| &view.label);
     Ok(Frame {
-        name: frame_name(&draft.file),
+        name: frame_name(&draft.file) + label,
         image,
         pixels: draft.pixels,
         camera,
         distortion: draft.distortion,
+        cut: view.map(|view| view.cut),
         other_shape,
         timestamp: draft.timestamp,
         depth: draft.depth,
         mask,
         visible: draft.visible,
     })
+}
+
+/// Intrinsics of a view: its lens, which an estimation may have changed, with its size.
+fn view_intrinsics(draft: &Draft, view: &DraftView) -> Intrinsics {
+    let k = view.cut.view;
+    match draft.lens {
+        Lens::Pixels(lens) => {
+            let [fx, fy, cx, cy] = lens.map(|v| v as f32);
+            Intrinsics { fx, fy, cx, cy, ..k }
+        }
+        Lens::Normalised(_) => k,
+    }
 }
 
 /// The mask of a picture; `None` without one that can be used.

@@ -6,6 +6,7 @@ pub mod colmap;
 pub mod find;
 mod json;
 pub mod matrices;
+pub(in crate::files) mod panoramas;
 pub mod protocol;
 pub mod re10k;
 pub mod scene;

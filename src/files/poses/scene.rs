@@ -11,16 +11,18 @@
 
 use super::assemble::{self, Draft, Lens, Pictures, assemble};
 use super::find::{Found, PoseFile, find, find_in, not_read};
+use super::panoramas::DraftView;
 use super::{cameras_json, colmap, matrices, re10k, transforms};
 use crate::files::photos::image::{LoadOptions, LoadedPicture, load_with, probe};
 use crate::files::photos::masks;
-use crate::files::photos::photograph::{Photograph, load_photograph};
+use crate::files::photos::photograph::{Photograph, load_photograph, load_photograph_or_panorama};
 use crate::files::photos::undistort::{Distortion, pinhole, undistort, undistort_masked};
+use crate::files::photos::views::Cut;
 use crate::files::{Error, Result};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::{DVec3, Vec3};
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use subsplat_kernels::camera::{Camera, NearFar};
 
@@ -98,6 +100,9 @@ pub struct Frame {
     pub camera: Camera,
     /// Lens distortion of the picture.
     pub distortion: Distortion,
+    /// The pinhole view of the picture that is this frame; `None` for the whole picture. Several frames may have
+    /// one picture, as those of a panorama.
+    pub cut: Option<Cut>,
     /// Size of the stored picture where it has another shape than the camera's. Such a frame cannot
     /// be loaded, and [`Scene::usable`] leaves it out.
     pub other_shape: Option<String>,
@@ -168,15 +173,23 @@ impl Frame {
                 LoadedPicture { mask: masks::checked(mask, &self.image)?, ..loaded }
             }
             Pixels::Upright => {
-                let Photograph { image: picture, mask, warnings, .. } =
-                    load_photograph(&self.image, options)?;
+                let loaded = match self.cut {
+                    Some(_) => load_photograph_or_panorama(&self.image, options)?.0,
+                    None => load_photograph(&self.image, options)?,
+                };
+                let Photograph { image: picture, mask, warnings, .. } = loaded;
                 LoadedPicture { picture, mask, warnings }
             }
         };
-        let k = &self.camera.intrinsics();
+        let k = &self.cut.map_or(self.camera.intrinsics(), |cut| cut.lens);
         if (picture.width, picture.height) != (k.width, k.height) {
             let got = format!("{}x{}", picture.width, picture.height);
             return Err(Error::format(&self.image, format!("{}x{}", k.width, k.height), got));
+        }
+        if let Some(cut) = &self.cut {
+            let (picture, mask) = cut.apply(&picture, mask.as_ref());
+            let mask = masks::checked(mask, &self.image)?;
+            return Ok(LoadedFrame { picture, mask, camera: self.camera, warnings });
         }
         let camera = self.pinhole()?;
         let (picture, mask) = match (self.distortion, mask) {
@@ -250,6 +263,40 @@ impl Scene {
         let drafts = photographs.iter().zip(names).map(|(photo, name)| upright_draft(photo, &name));
         assemble(path.as_ref(), source, Pictures::Needed, drafts.collect())
     }
+
+    /// [`Scene::from_photographs`] of photographs and of views of them.
+    pub(crate) fn from_views(
+        source: SceneFormat,
+        path: &Path,
+        views: &[PosedView],
+    ) -> Result<Self> {
+        let mut files: Vec<&Path> = views.iter().map(|view| view.photograph.as_path()).collect();
+        files.dedup();
+        let names = distinct_names(files.iter().copied());
+        let named: HashMap<&Path, &Path> =
+            files.iter().copied().zip(names.iter().map(PathBuf::as_path)).collect();
+        let draft = |view: &PosedView| {
+            let name = named.get(view.photograph.as_path()).copied().unwrap_or(Path::new(""));
+            let draft = upright_draft(&(view.photograph.clone(), view.camera), name);
+            let label = view.label.clone();
+            Draft { view: view.cut.map(|cut| DraftView { cut, label }), ..draft }
+        };
+        let drafts = views.iter().map(draft).collect();
+        assemble(path, source, Pictures::Needed, drafts)
+    }
+}
+
+/// A photograph, or a view of one, with its camera.
+#[derive(Clone, Debug)]
+pub(crate) struct PosedView {
+    /// File.
+    pub photograph: PathBuf,
+    /// The view; `None` for the whole photograph.
+    pub cut: Option<Cut>,
+    /// End of the view's name.
+    pub label: String,
+    /// Camera of the view.
+    pub camera: Camera,
 }
 
 /// Names of photographs: those of the files where all differ, else the paths below the folder that all have in

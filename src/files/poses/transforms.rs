@@ -5,7 +5,7 @@
 //! (else `fl_x`), `cx`, `cy` (else the middle), `w`, `h` (else the stored picture's). Files
 //! without `fl_x` have `camera_angle_x` and `camera_angle_y` in radians. Camera models: none
 //! given, SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
-//! OPENCV_FISHEYE. `mask_path` of a frame names its mask ([`super::scene::Frame::mask`]). Other keys
+//! OPENCV_FISHEYE, EQUIRECTANGULAR (a picture becomes several frames, `super::panoramas`). `mask_path` of a frame names its mask ([`super::scene::Frame::mask`]). Other keys
 //! (`aabb_scale`, `sharpness`, `ply_file_path`, …) are ignored.
 
 use super::assemble::{Draft, Lens, Pictures, assemble, find_image};
@@ -13,6 +13,7 @@ use super::cameras_json::{matrix, side};
 use super::json;
 use super::scene::{Scene, SceneFormat};
 use crate::files::photos::undistort::Distortion;
+use crate::files::photos::views::panorama_intrinsics;
 use crate::files::{Error, Result, read};
 use glam::{DMat4, DVec4};
 use serde::Deserialize;
@@ -84,6 +85,7 @@ impl Optics {
                 Ok(Distortion::brown([k[0], k[1], k[2], 0.0, 0.0, 0.0], p))
             }
             "FULL_OPENCV" => Ok(Distortion::brown(k, p)),
+            "EQUIRECTANGULAR" => Ok(Distortion::Equirectangular),
             _ => Err(format!("`{model}`")),
         }
     }
@@ -132,8 +134,8 @@ fn draft(path: &Path, place: String, frame: FileFrame, file: &Optics) -> Result<
     let optics = frame.optics.over(file);
     let distortion = optics.distortion().map_err(|got| {
         bad(
-            "camera_model SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV \
-             or OPENCV_FISHEYE",
+            "camera_model SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, \
+             OPENCV_FISHEYE or EQUIRECTANGULAR",
             got,
         )
     })?;
@@ -160,7 +162,7 @@ fn draft(path: &Path, place: String, frame: FileFrame, file: &Optics) -> Result<
         }
         (None, None) => None,
     };
-    let lens = lens(&optics, stored).map_err(|got| {
+    let lens = lens(&optics, &distortion, stored).map_err(|got| {
         bad("fl_x, or camera_angle_x between 0 and π (for the file or the frame)", got)
     })?;
     let pose = opengl_to_opencv(pose);
@@ -175,8 +177,16 @@ fn draft(path: &Path, place: String, frame: FileFrame, file: &Optics) -> Result<
 
 /// Computes pixel intrinsics for a picture of `size`. A frame without a size has no picture
 /// and is left out later; its intrinsics are not used.
-fn lens(o: &Optics, size: Option<(usize, usize)>) -> std::result::Result<Lens, String> {
+fn lens(
+    o: &Optics,
+    distortion: &Distortion,
+    size: Option<(usize, usize)>,
+) -> std::result::Result<Lens, String> {
     let (w, h) = size.map_or((1.0, 1.0), |(w, h)| (w as f64, h as f64));
+    // A panorama has no focal length; nerfstudio writes half of its sides.
+    if *distortion == Distortion::Equirectangular {
+        return Ok(Lens::Pixels(panorama_intrinsics(w, h)));
+    }
     let focal = |side: f64, angle: Option<f64>| match angle {
         Some(a) if a > 0.0 && a < std::f64::consts::PI => Ok(Some(0.5 * side / (0.5 * a).tan())),
         Some(a) => Err(format!("an angle of {a}")),

@@ -387,6 +387,7 @@ mod tests {
             pixels: Pixels::Stored,
             camera,
             distortion: Distortion::None,
+            cut: None,
             timestamp: None,
             depth: None,
             mask: None,

@@ -1,6 +1,7 @@
 //! Oracles, scenes and file writers that several test programs share.
 
 pub mod answers;
+pub mod box_room;
 pub mod checkpoints;
 pub mod chunk_files;
 pub mod colmap_files;

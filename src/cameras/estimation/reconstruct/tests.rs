@@ -52,8 +52,12 @@ fn photograph(points: &[DVec3], pose: &Absolute) -> PosePhoto {
 /// are matched.
 fn edge(photos: &[PosePhoto], [i, j]: [usize; 2], shared: usize, relative: Relative) -> Edge {
     let deviation = deviations(&photos[i])[0];
-    let bearings =
-        |k: usize| Bearings { a: photos[i].bearings[k], b: photos[j].bearings[k], deviation };
+    let bearings = |k: usize| Bearings {
+        a: photos[i].bearings[k],
+        b: photos[j].bearings[k],
+        deviation,
+        views: None,
+    };
     let estimate = PairEstimate {
         refined: Refined { relative, focal_scale: 1.0, information: Default::default() },
         inliers: (0..shared).map(|k| Pair { a: k, b: k, ratio: 0.5 }).collect(),

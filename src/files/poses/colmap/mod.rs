@@ -3,10 +3,9 @@
 //! Poses in the file are camera-from-world (quaternion wxyz and translation), OpenCV
 //! axes; pixel centres lie at +0.5, as here. `rigs.*` and `frames.*` of COLMAP 4 are
 //! ignored: `images.*` still holds every pose. Distortion is removed when a frame is
-//! loaded ([`crate::files::photos::undistort`]). Camera models read: SIMPLE_PINHOLE, PINHOLE,
-//! SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE, FULL_OPENCV,
-//! SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, SIMPLE_FISHEYE, FISHEYE; others are refused
-//! by name.
+//! loaded ([`crate::files::photos::undistort`]). Camera models that are read: [`MODELS_READ`]; others are
+//! refused by name. An EQUIRECTANGULAR picture becomes several frames
+//! ([`crate::files::photos::views`]).
 //!
 //! Frames are sorted by picture name, as COLMAP's image ids follow no order.
 //! Layout: COLMAP, `src/colmap/scene/reconstruction_io_{binary,text}` and the
@@ -19,6 +18,7 @@ mod write;
 use super::assemble::{Draft, Lens, Pictures, assemble, find_image};
 use super::scene::{Scene, SceneFormat};
 use crate::files::photos::undistort::Distortion;
+use crate::files::photos::views::panorama_intrinsics;
 use crate::files::{Error, Result, read};
 use glam::{DMat4, DQuat, DVec3};
 use std::collections::HashMap;
@@ -92,7 +92,7 @@ pub(super) fn is_model(folder: &Path) -> bool {
 
 /// COLMAP's camera models by number: name and number of parameters. Models that [`lens`]
 /// does not support are listed so that errors name them.
-const MODELS: [(&str, usize); 16] = [
+const MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -109,12 +109,15 @@ const MODELS: [(&str, usize); 16] = [
     ("DIVISION", 5),
     ("SIMPLE_FISHEYE", 3),
     ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 ];
 
 /// For messages.
 const MODELS_READ: &str = "a camera model among SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, \
-                           OPENCV, OPENCV_FISHEYE, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, \
-                           RADIAL_FISHEYE, SIMPLE_FISHEYE, FISHEYE";
+                           OPENCV, OPENCV_FISHEYE, FULL_OPENCV, FOV, SIMPLE_RADIAL_FISHEYE, \
+                           RADIAL_FISHEYE, THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE, \
+                           SIMPLE_DIVISION, DIVISION, SIMPLE_FISHEYE, FISHEYE, EQUIRECTANGULAR";
 
 /// Focal lengths, principal point and distortion of a camera.
 struct LensParameters {
@@ -148,6 +151,24 @@ fn lens(model: &str, p: &[f64]) -> Option<LensParameters> {
         "RADIAL_FISHEYE" => one_fisheye([p[3], p[4], 0.0, 0.0]),
         "SIMPLE_FISHEYE" => one_fisheye([0.0; 4]),
         "FISHEYE" => two(Distortion::fisheye([0.0; 4])),
+        "FOV" => two(Distortion::Fov { omega: p[4] }),
+        "THIN_PRISM_FISHEYE" => two(Distortion::ThinPrismFisheye {
+            k: [p[4], p[5], p[8], p[9]],
+            p: [p[6], p[7]],
+            s: [p[10], p[11]],
+        }),
+        "RAD_TAN_THIN_PRISM_FISHEYE" => two(Distortion::RadTanThinPrismFisheye {
+            k: [p[4], p[5], p[6], p[7], p[8], p[9]],
+            p: [p[10], p[11]],
+            s: [p[12], p[13], p[14], p[15]],
+        }),
+        "SIMPLE_DIVISION" => one_focal(Distortion::Division { k: p[3] }),
+        "DIVISION" => two(Distortion::Division { k: p[4] }),
+        // Its parameters are the size, which every camera has.
+        "EQUIRECTANGULAR" => {
+            let focal_and_center = panorama_intrinsics(p[0], p[1]);
+            LensParameters { focal_and_center, distortion: Distortion::Equirectangular }
+        }
         _ => return None,
     })
 }

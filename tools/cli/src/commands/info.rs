@@ -124,6 +124,9 @@ fn picture(path: &Path, answer: Answer) -> Result<Value> {
             focal.source
         ));
     }
+    if header.panorama {
+        answer.line("  a panorama (equirectangular): `run` and `poses` make views of it");
+    }
     header.warnings.iter().for_each(|w| answer.line(format!("  warning: {w}")));
     Ok(json!({
         "kind": "picture",
@@ -133,6 +136,7 @@ fn picture(path: &Path, answer: Answer) -> Result<Value> {
         "exif_orientation": p.orientation,
         "camera": names.join(" "),
         "focal_px": camera.focal.map(|f| f.px),
+        "panorama": header.panorama,
     }))
 }
 

@@ -14,13 +14,14 @@ use subsplat::files::poses::find::{folders, is_own_output, not_read};
 use subsplat::files::poses::matrices;
 use subsplat::files::poses::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
 use subsplat::files::poses::scene::{Scene, SceneFormat, has_scene, load_scene};
-use subsplat::reconstruct::KnownLens;
+use subsplat::reconstruct::{KnownLens, Projection};
 use subsplat::{EstimateOptions, EstimatedScene, estimate_cameras_of_files};
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones.
 pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Scene> {
     if let ([a, b], true) = (input, args.has_pose()) {
+        ensure!(args.lens.is_none(), "--lens: only without --move and --pose-b");
         return of_photographs(a, b, args);
     }
     if let Some(photographs) = photographs(input)? {
@@ -31,6 +32,7 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
             fov: args.fov,
             intrinsics: args.intrinsics.as_deref(),
             force: args.force,
+            projection: args.lens.unwrap_or_default(),
         };
         let estimated = estimate(&input[0], &photographs, &options, bar)?;
         bar.suspend(|| print_estimate(&estimated));
@@ -154,6 +156,8 @@ pub struct EstimateRequest<'a> {
     pub intrinsics: Option<&'a str>,
     /// Accept what would be refused.
     pub force: bool,
+    /// Projection of the photographs.
+    pub projection: Projection,
 }
 
 /// Estimates the cameras of photographs; `bar` shows the photograph that is read.
@@ -176,7 +180,14 @@ pub fn estimate(
         lens,
         poses: PoseOptions::default().with_uncertain(uncertain),
         load: LoadOptions { truncated },
+        projection: request.projection,
     };
+    let wide = matches!(options.projection, Projection::Panorama | Projection::Fisheye(_));
+    ensure!(
+        !wide || lens.is_none(),
+        "--lens: expected no --fov and no --intrinsics beside a panorama or a fisheye lens, whose angle is fixed \
+         (give fisheye:DEGREES)"
+    );
     let mut show = |i: usize| {
         bar.set_message(format!("photograph {} of {}", i + 1, photographs.len()));
         Ok(())
@@ -262,6 +273,7 @@ impl PairArgs {
         let flags = [
             (self.fov.is_some(), "--fov"),
             (self.intrinsics.is_some(), "--intrinsics"),
+            (self.lens.is_some(), "--lens"),
             (self.translation.is_some(), "--move"),
             (self.turn.is_some(), "--turn"),
             (self.pose_a.is_some(), "--pose-a"),

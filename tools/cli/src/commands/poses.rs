@@ -8,10 +8,11 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use subsplat::EstimatedScene;
 use subsplat::cameras::estimation::Confidence;
+use subsplat::files::photos::image::save_png;
 use subsplat::files::poses::cameras_json::save_cameras_and_points;
 use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera};
 use subsplat::files::poses::colmap::{SparsePoint, save_colmap};
-use subsplat::files::poses::scene::{Units, distinct_names};
+use subsplat::files::poses::scene::{Frame, Pixels, Units, distinct_names};
 use subsplat_kernels::camera::Camera;
 
 /// Runs the command.
@@ -25,6 +26,7 @@ pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
         fov: args.fov,
         intrinsics: args.intrinsics.as_deref(),
         force: args.force,
+        projection: args.lens.unwrap_or_default(),
     };
     let estimated = progress
         .stage("cameras", |bar| pair::estimate(&args.input[0], &photographs, &request, bar))?;
@@ -43,9 +45,18 @@ fn write(out: &Path, estimated: &EstimatedScene) -> Result<Vec<PathBuf>> {
     std::fs::create_dir_all(folder)
         .with_context(|| format!("output folder {}", folder.display()))?;
     let frames = &estimated.scene.frames;
+    let pictures = pictures(folder, frames)?;
     let cameras = frames
         .iter()
-        .map(|f| Ok(NamedCamera::of_frame(f, path_from(folder, &f.image)?)))
+        .zip(&pictures)
+        .map(|(frame, picture)| {
+            let named = NamedCamera::of_frame(frame, path_from(folder, picture)?);
+            // A view that was written is not turned again.
+            Ok(match frame.cut {
+                Some(_) => NamedCamera { pixels: Pixels::Stored, ..named },
+                None => named,
+            })
+        })
         .collect::<Result<Vec<_>>>()?;
     let content =
         CameraFile { cameras, units: Units::Unknown, near_far: None, ..Default::default() };
@@ -54,11 +65,27 @@ fn write(out: &Path, estimated: &EstimatedScene) -> Result<Vec<PathBuf>> {
     let model = folder.join("sparse/0");
     let mut files = vec![file];
     if !is_file {
-        let (images, points) = colmap(estimated);
+        let (images, points) = colmap(estimated, &pictures);
         save_colmap(&model, &images, &points)?;
         files.push(model);
     }
     Ok(files)
+}
+
+/// The picture of each frame: its photograph, or a view of it, which is written to `views/` in the folder.
+fn pictures(folder: &Path, frames: &[Frame]) -> Result<Vec<PathBuf>> {
+    let picture = |frame: &Frame| {
+        if frame.cut.is_none() {
+            return Ok(frame.image.clone());
+        }
+        let path = folder.join("views").join(format!("{}.png", frame.name));
+        let parent = path.parent().unwrap_or(folder);
+        std::fs::create_dir_all(parent)
+            .with_context(|| format!("output folder {}", parent.display()))?;
+        save_png(&path, &frame.load()?.0)?;
+        Ok(path)
+    };
+    frames.iter().map(picture).collect()
 }
 
 /// Path of a picture from a folder: relative where it lies inside, else absolute.
@@ -89,23 +116,22 @@ fn check_names(photographs: &[PathBuf]) -> Result<()> {
 
 /// Images and points of COLMAP's model. Names are those of the files, or paths below the folder that all
 /// photographs have in common: COLMAP's programs get that folder as their image path.
-fn colmap(estimated: &EstimatedScene) -> (Vec<(String, Camera)>, Vec<SparsePoint>) {
+fn colmap(
+    estimated: &EstimatedScene,
+    pictures: &[PathBuf],
+) -> (Vec<(String, Camera)>, Vec<SparsePoint>) {
     let frames = &estimated.scene.frames;
-    let names = distinct_names(frames.iter().map(|f| f.image.as_path()));
+    let names = distinct_names(pictures.iter().map(PathBuf::as_path));
     let name = |name: PathBuf| name.to_string_lossy().replace('\\', "/");
     let images = names.into_iter().map(name).zip(frames.iter().map(|f| f.camera)).collect();
-    let placed: Vec<usize> = (0..estimated.estimate.cameras.len())
-        .filter(|&i| estimated.estimate.cameras[i].is_some())
-        .collect();
-    let points = estimated.estimate.points.iter().map(|p| SparsePoint {
+    let points = estimated.estimate.points.iter().zip(&estimated.observations);
+    // Points above and below all views of a panorama.
+    let points = points.filter(|(_, observations)| observations.len() >= 2);
+    let points = points.map(|(p, observations)| SparsePoint {
         position: p.position,
         colour: p.colour,
         error_px: p.error_px,
-        track: p
-            .observations
-            .iter()
-            .filter_map(|(photo, px)| Some((placed.binary_search(photo).ok()?, *px)))
-            .collect(),
+        track: observations.clone(),
     });
     (images, points.collect())
 }

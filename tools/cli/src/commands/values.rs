@@ -1,6 +1,7 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
 use super::args::{InputSizeArg, PictureSizeArg};
+use subsplat::reconstruct::{FisheyeCurve, FisheyeLens, Projection};
 use subsplat::{Density, Refine};
 use subsplat_kernels::camera::Intrinsics;
 use subsplat_kernels::layout::CHILDREN_MAX;
@@ -140,6 +141,35 @@ pub fn fov(text: &str) -> Result<f32, String> {
     real(text, |v| v > 0.0 && v < 180.0, "degrees above 0 and below 180")
 }
 
+/// Parses the lens of photographs: `pinhole`, `panorama`, or `fisheye` with an angle, degrees, and a curve.
+pub fn projection(text: &str) -> Result<Projection, String> {
+    let expected = || {
+        "expected pinhole, panorama or fisheye[:DEGREES][:equidistant|equisolid|stereographic], with 20 to 300 \
+         degrees"
+            .to_owned()
+    };
+    let mut words = text.split(':');
+    match (words.next(), text.contains(':')) {
+        (Some("pinhole"), false) => return Ok(Projection::Pinhole),
+        (Some("panorama"), false) => return Ok(Projection::Panorama),
+        (Some("fisheye"), _) => {}
+        _ => return Err(expected()),
+    }
+    let mut lens = FisheyeLens::default();
+    for (i, word) in words.enumerate() {
+        match (word, word.parse::<f64>()) {
+            (_, Ok(degrees)) if i == 0 && (20.0..=300.0).contains(&degrees) => {
+                lens.angle = degrees.to_radians();
+            }
+            ("equidistant", _) if i < 2 => lens.curve = FisheyeCurve::Equidistant,
+            ("equisolid", _) if i < 2 => lens.curve = FisheyeCurve::Equisolid,
+            ("stereographic", _) if i < 2 => lens.curve = FisheyeCurve::Stereographic,
+            _ => return Err(expected()),
+        }
+    }
+    Ok(Projection::Fisheye(lens))
+}
+
 /// Parses a least opacity.
 pub fn opacity(text: &str) -> Result<f32, String> {
     real(text, |v| (0.0..1.0).contains(&v), "0 to below 1")
@@ -210,6 +240,35 @@ pub fn part(text: &str) -> Result<(usize, usize), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lenses_of_photographs() {
+        assert_eq!(projection("pinhole"), Ok(Projection::Pinhole));
+        assert_eq!(projection("panorama"), Ok(Projection::Panorama));
+        let fisheye = |degrees: f64, curve| {
+            Ok(Projection::Fisheye(FisheyeLens { angle: degrees.to_radians(), curve }))
+        };
+        assert_eq!(projection("fisheye"), fisheye(180.0, FisheyeCurve::Equidistant));
+        assert_eq!(projection("fisheye:190"), fisheye(190.0, FisheyeCurve::Equidistant));
+        assert_eq!(projection("fisheye:equisolid"), fisheye(180.0, FisheyeCurve::Equisolid));
+        let both = projection("fisheye:150.5:stereographic");
+        assert_eq!(both, fisheye(150.5, FisheyeCurve::Stereographic));
+        let wrong = [
+            "",
+            "lens",
+            "panorama:180",
+            "pinhole:",
+            "fisheye:",
+            "fisheye:5",
+            "fisheye:400",
+            "fisheye:NaN",
+            "fisheye:equisolid:180",
+            "fisheye:180:equisolid:1",
+        ];
+        for text in wrong {
+            assert!(projection(text).unwrap_err().contains("stereographic"), "{text}");
+        }
+    }
 
     #[test]
     fn numbers_of_gaussians() {

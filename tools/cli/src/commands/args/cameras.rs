@@ -3,6 +3,7 @@
 use super::groups::CAMERAS;
 use crate::commands::values;
 use clap::{Args, ValueEnum};
+use subsplat::reconstruct::Projection;
 
 /// Cameras of photographs that come without a pose file.
 ///
@@ -27,6 +28,13 @@ pub struct PairArgs {
     /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
     #[arg(long, value_name = "K", hide_short_help = true, help_heading = CAMERAS)]
     pub intrinsics: Option<String>,
+    /// Lens of the photographs: pinhole, panorama, or fisheye[:DEG][:CURVE].
+    ///
+    /// By default a picture is a panorama where the file says so, or where it is twice as wide as high and its left and right
+    /// edges continue each other; else a photograph. Six views of 90 degrees are made of a panorama, one of at most 90 degrees
+    /// of a fisheye picture. DEG: angle across the circle (180). CURVE: equidistant (the default), equisolid or stereographic.
+    #[arg(long, value_name = "LENS", value_parser = values::projection, hide_short_help = true, help_heading = CAMERAS)]
+    pub lens: Option<Projection>,
     /// Position of the second of two cameras as seen from the first: right, down, forward.
     ///
     /// Its unit becomes that of the scene.

@@ -3,6 +3,7 @@
 use crate::commands::values;
 use clap::Args;
 use std::path::PathBuf;
+use subsplat::reconstruct::Projection;
 
 /// Arguments of `poses`.
 #[derive(Debug, Args)]
@@ -24,6 +25,13 @@ pub struct PosesArgs {
     /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
     #[arg(long, value_name = "K")]
     pub intrinsics: Option<String>,
+    /// Lens of the photographs: pinhole, panorama, or fisheye[:DEG][:CURVE].
+    ///
+    /// By default a picture is a panorama where the file says so, or where it is twice as wide as high and its left and right
+    /// edges continue each other; else a photograph. Six views of 90 degrees are made of a panorama, one of at most 90 degrees
+    /// of a fisheye picture. DEG: angle across the circle (180). CURVE: equidistant (the default), equisolid or stereographic.
+    #[arg(long, value_name = "LENS", value_parser = values::projection)]
+    pub lens: Option<Projection>,
     /// Accept doubtful cameras and truncated JPEG files.
     #[arg(long)]
     pub force: bool,

@@ -1,0 +1,343 @@
+//! Photographs of several projections before and after the estimation of their cameras: pinhole photographs,
+//! pictures of fisheye lenses (one pinhole view of each), and panoramas (views of one centre with known
+//! rotations).
+
+use super::Result;
+use super::estimate_cameras::{EstimateOptions, LensSource, lens};
+use crate::cameras::estimation::{Lens, PhotoView, PoseEstimate, PosePhoto, PosePoint};
+use crate::files::Error as FileError;
+use crate::files::photos::photograph::{Photograph, load_photograph_or_panorama, panorama_shape};
+use crate::files::photos::shape::{ImageCircle, edges_meet, image_circle};
+use crate::files::photos::undistort::Distortion;
+use crate::files::photos::views::{
+    Cut, YAWS, fisheye_cut, has_panorama_shape, own_axes, panorama_cut, panorama_view, shared_axes,
+    view_label,
+};
+use crate::files::poses::scene::PosedView;
+use crate::scene::mask::Mask;
+use crate::scene::pictures::Rgb;
+use glam::{DMat3, DVec2, DVec3, Mat4};
+use std::f64::consts::PI;
+use std::path::Path;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+
+/// Projection of photographs without a pose file.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[non_exhaustive]
+pub enum Projection {
+    /// A panorama where the file's metadata say so, or where a picture of two to one has edges that continue each
+    /// other; else a pinhole.
+    #[default]
+    Detected,
+    /// A pinhole, whatever the file says.
+    Pinhole,
+    /// An equirectangular panorama of 360° by 180°.
+    Panorama,
+    /// A fisheye lens.
+    Fisheye(FisheyeLens),
+}
+
+/// A fisheye lens, whose image circle is found in each picture. Without a circle the angle spans the picture's
+/// diagonal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FisheyeLens {
+    /// Angle across the image circle, radians.
+    pub angle: f64,
+    /// Radius of a direction in the picture.
+    pub curve: FisheyeCurve,
+}
+
+impl Default for FisheyeLens {
+    fn default() -> Self {
+        Self { angle: PI, curve: FisheyeCurve::default() }
+    }
+}
+
+/// Radius r of a direction at the angle θ from the axis, f the focal length.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum FisheyeCurve {
+    /// r = f·θ.
+    #[default]
+    Equidistant,
+    /// r = 2f·sin(θ/2).
+    Equisolid,
+    /// r = 2f·tan(θ/2).
+    Stereographic,
+}
+
+impl FisheyeCurve {
+    /// Radius for f = 1.
+    fn radius(self, theta: f64) -> f64 {
+        match self {
+            Self::Equidistant => theta,
+            Self::Equisolid => 2.0 * (0.5 * theta).sin(),
+            Self::Stereographic => 2.0 * (0.5 * theta).tan(),
+        }
+    }
+
+    /// The radius as a polynomial: Taylor's series. Views reach 60°, where the error is below 2e-5.
+    fn distortion(self) -> Distortion {
+        Distortion::fisheye(match self {
+            Self::Equidistant => [0.0; 4],
+            Self::Equisolid => [-1.0 / 24.0, 1.0 / 1920.0, -1.0 / 322_560.0, 0.0],
+            Self::Stereographic => [1.0 / 12.0, 1.0 / 120.0, 17.0 / 20_160.0, 31.0 / 362_880.0],
+        })
+    }
+}
+
+/// Projection of one photograph, found or given.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Shape {
+    Pinhole,
+    /// The estimated camera is that of the view.
+    Fisheye(Cut),
+    /// The estimated camera is the panorama's.
+    Panorama {
+        width: usize,
+        height: usize,
+    },
+}
+
+/// A photograph as the estimation sees it.
+pub(super) struct Prepared {
+    /// Features.
+    pub photo: PosePhoto,
+    /// Origin of the focal length.
+    pub source: LensSource,
+    /// Warnings about the photograph.
+    pub warnings: Vec<String>,
+    shape: Shape,
+}
+
+/// Loads a photograph and detects at most `features` features.
+///
+/// # Errors
+/// A photograph that cannot be read; a panorama or a fisheye picture that is none, by its shape.
+pub(super) fn prepare(path: &Path, options: &EstimateOptions, features: usize) -> Result<Prepared> {
+    let (mut photograph, stated) = load_photograph_or_panorama(path, &options.load)?;
+    let mut warnings = std::mem::take(&mut photograph.warnings);
+    let Rgb { width, height, .. } = photograph.image;
+    let panorama = match options.projection {
+        Projection::Panorama => true,
+        Projection::Pinhole | Projection::Fisheye(_) => false,
+        Projection::Detected if stated => true,
+        Projection::Detected => {
+            let suspect = panorama_shape(&photograph.camera, width, height, path);
+            let meet = suspect.is_some() && edges_meet(&photograph.image);
+            if meet {
+                warnings.push(format!(
+                    "{}: read as a panorama, because its left and right edges continue each other; --lens pinhole \
+                     reads it as a photograph",
+                    path.display()
+                ));
+            } else {
+                warnings.extend(suspect);
+            }
+            meet
+        }
+    };
+    if panorama {
+        return of_panorama(path, &photograph, features, warnings);
+    }
+    if let Projection::Fisheye(fisheye) = options.projection {
+        return of_fisheye(path, &photograph, fisheye, features, warnings);
+    }
+    if options.projection == Projection::Detected && image_circle(&photograph.image).is_some() {
+        warnings.push(format!(
+            "{}: a bright disc on black looks like the circle of a fisheye lens, which is read wrongly as a \
+             photograph: --lens fisheye (or fisheye:190 for a lens of 190 degrees) reads it",
+            path.display()
+        ));
+    }
+    let (lens, source) = lens(&photograph, options.lens);
+    let Photograph { image, mask, .. } = photograph;
+    let photo = PosePhoto::from_picture(&image, mask.as_ref(), lens, features)?;
+    Ok(Prepared { photo, source, warnings, shape: Shape::Pinhole })
+}
+
+fn of_panorama(
+    path: &Path,
+    photograph: &Photograph,
+    features: usize,
+    warnings: Vec<String>,
+) -> Result<Prepared> {
+    let Rgb { width, height, .. } = photograph.image;
+    if !has_panorama_shape(width, height) {
+        let expected = "a panorama of 360x180 degrees, twice as wide as high";
+        return Err(FileError::format(path, expected, format!("{width}x{height} pixels")).into());
+    }
+    let axes = own_axes();
+    let views: Vec<(Rgb, Option<Mask>)> = axes
+        .iter()
+        .map(|axes| panorama_cut(width, height, *axes))
+        .map(|cut| cut.apply(&photograph.image, photograph.mask.as_ref()))
+        .collect();
+    let views: Vec<PhotoView<'_>> = views
+        .iter()
+        .zip(&axes)
+        .map(|((picture, mask), axes)| PhotoView {
+            picture,
+            mask: mask.as_ref(),
+            view_from_photo: axes.transpose(),
+        })
+        .collect();
+    // A panorama shows more than one photograph, but each part of it is matched with one part of another.
+    let photo = PosePhoto::from_views(&views, panorama_view(width), features / 3)?;
+    let shape = Shape::Panorama { width, height };
+    Ok(Prepared { photo, source: LensSource::Panorama, warnings, shape })
+}
+
+fn of_fisheye(
+    path: &Path,
+    photograph: &Photograph,
+    fisheye: FisheyeLens,
+    features: usize,
+    mut warnings: Vec<String>,
+) -> Result<Prepared> {
+    let Rgb { width, height, .. } = photograph.image;
+    let circle = image_circle(&photograph.image);
+    let (centre, radius) = match circle {
+        Some(ImageCircle { centre, radius }) => (centre, radius),
+        None => {
+            let (w, h) = (width as f64, height as f64);
+            warnings.push(format!(
+                "{}: no circle of a fisheye lens is found: the angle of {:.0} degrees is taken across the diagonal",
+                path.display(),
+                fisheye.angle.to_degrees()
+            ));
+            ([0.5 * w, 0.5 * h], 0.5 * w.hypot(h))
+        }
+    };
+    let focal = (radius / fisheye.curve.radius(0.5 * fisheye.angle)) as f32;
+    let [cx, cy] = centre.map(|v| v as f32);
+    let lens = Intrinsics { fx: focal, fy: focal, cx, cy, width, height };
+    let rim = circle.map(|circle| circle.radius);
+    let cut = fisheye_cut(&lens, &fisheye.curve.distortion(), rim).ok_or_else(|| {
+        let got = format!("{width}x{height} pixels with the lens's centre at ({cx:.0}, {cy:.0})");
+        FileError::format(path, "a fisheye picture that shows what is straight ahead", got)
+    })?;
+    let (picture, mask) = cut.apply(&photograph.image, photograph.mask.as_ref());
+    let Intrinsics { width, height, fx, .. } = cut.view;
+    let photo = PosePhoto::from_picture(
+        &picture,
+        mask.as_ref(),
+        Lens::stated(fx, width, height),
+        features,
+    )?;
+    let shape = Shape::Fisheye(cut);
+    Ok(Prepared { photo, source: LensSource::Fisheye, warnings, shape })
+}
+
+/// Frames of photographs with estimated cameras.
+pub(super) struct Posed {
+    /// One frame for a photograph, [`YAWS`] for a panorama; in the order of the photographs.
+    pub views: Vec<PosedView>,
+    /// For each point of the estimate, the frames that show it and its positions in them, px.
+    pub observations: Vec<Vec<(usize, [f32; 2])>>,
+}
+
+/// The projections of all photographs, as far as frames depend on them.
+pub(super) struct Shapes(Vec<Shape>);
+
+impl Shapes {
+    pub fn new(prepared: &[Prepared]) -> Self {
+        Self(prepared.iter().map(|p| p.shape).collect())
+    }
+
+    /// A warning of panoramas beside photographs whose focal length is not known.
+    pub fn warning(&self, lenses: &[LensSource]) -> Option<String> {
+        let panoramas = lenses.contains(&LensSource::Panorama);
+        let assumed = lenses.iter().filter(|lens| **lens == LensSource::Assumed).count();
+        (panoramas && assumed > 0).then(|| {
+            format!(
+                "{assumed} photographs have no stated focal length, which is not estimated beside panoramas: 0.75 of \
+                 the longer side is taken; give --fov"
+            )
+        })
+    }
+
+    /// Frames and observations of an estimate.
+    pub fn posed(&self, photographs: &[&Path], estimate: &PoseEstimate) -> Posed {
+        let placed = || {
+            let cameras = self.0.iter().zip(photographs).zip(&estimate.cameras).enumerate();
+            cameras.filter_map(|(i, ((shape, path), camera))| Some((i, *shape, *path, (*camera)?)))
+        };
+        let panoramas: Vec<(DMat3, DVec3)> = placed()
+            .filter(|(_, shape, ..)| matches!(shape, Shape::Panorama { .. }))
+            .map(|(.., camera)| axes_and_position(&camera))
+            .collect();
+        let axes = shared_axes(&panoramas);
+        let mut views = Vec::new();
+        let mut first = vec![None; self.0.len()];
+        for (i, shape, path, camera) in placed() {
+            first[i] = Some(views.len());
+            let one =
+                |cut| PosedView { photograph: path.to_owned(), cut, label: String::new(), camera };
+            match shape {
+                Shape::Pinhole => views.push(one(None)),
+                Shape::Fisheye(cut) => views.push(one(Some(cut))),
+                Shape::Panorama { width, height } => {
+                    let (rotation, position) = axes_and_position(&camera);
+                    for (n, view) in axes.iter().enumerate() {
+                        let cut = panorama_cut(width, height, rotation.transpose() * *view);
+                        let pose = Mat4::from_mat3_translation(view.as_mat3(), position.as_vec3());
+                        // The intrinsics are those of a panorama's view, the axes orthonormal.
+                        let camera = Camera::new(cut.view, pose).unwrap_or(camera);
+                        let label = view_label(n);
+                        views.push(PosedView { cut: Some(cut), label, camera, ..one(None) });
+                    }
+                }
+            }
+        }
+        let observations = estimate
+            .points
+            .iter()
+            .map(|point| self.observed(point, &first, &views, &estimate.cameras))
+            .collect();
+        Posed { views, observations }
+    }
+
+    /// Frames that show a point where its photograph does.
+    fn observed(
+        &self,
+        point: &PosePoint,
+        first: &[Option<usize>],
+        views: &[PosedView],
+        cameras: &[Option<Camera>],
+    ) -> Vec<(usize, [f32; 2])> {
+        let mut all = Vec::new();
+        for (photo, px) in &point.observations {
+            let (Some(start), Some(camera)) = (first[*photo], cameras[*photo]) else { continue };
+            let Shape::Panorama { .. } = self.0[*photo] else {
+                all.push((start, *px));
+                continue;
+            };
+            let ray = own_ray(&camera.intrinsics(), *px);
+            let (rotation, _) = axes_and_position(&camera);
+            for (i, view) in views[start..start + YAWS].iter().enumerate() {
+                let k = view.camera.intrinsics();
+                let ray = axes_and_position(&view.camera).0.transpose() * (rotation * ray);
+                let at = ray.truncate() / ray.z;
+                let at = [k.fx * at.x as f32 + k.cx, k.fy * at.y as f32 + k.cy];
+                let inside = (0.0..=k.width as f32).contains(&at[0])
+                    && (0.0..=k.height as f32).contains(&at[1]);
+                if ray.z > 0.0 && inside {
+                    all.push((start + i, at));
+                }
+            }
+        }
+        all
+    }
+}
+
+/// Direction in a panorama of a position in its views side by side, px ([`PosePhoto::from_views`]).
+fn own_ray(view: &Intrinsics, px: [f32; 2]) -> DVec3 {
+    let n = ((px[0] / view.width as f32) as usize).min(YAWS - 1);
+    let x = px[0] - (n * view.width) as f32;
+    let at = DVec2::new(f64::from((x - view.cx) / view.fx), f64::from((px[1] - view.cy) / view.fy));
+    own_axes()[n] * at.extend(1.0)
+}
+
+fn axes_and_position(camera: &Camera) -> (DMat3, DVec3) {
+    (camera.rotation().as_dmat3(), camera.position().as_dvec3())
+}

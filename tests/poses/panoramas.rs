@@ -1,0 +1,197 @@
+//! Cameras of panoramas and of fisheye pictures, which a ray caster draws (`box_room`).
+
+use glam::{DMat3, DVec2, DVec3, Mat4};
+use std::path::PathBuf;
+use subsplat::cameras::estimation::Confidence;
+use subsplat::kernels::camera::{Camera, Intrinsics};
+use subsplat::reconstruct::{FisheyeCurve, FisheyeLens, LensSource, Projection};
+use subsplat::{EstimateOptions, EstimatedScene, Result, Rgb, estimate_cameras_of_files, save_png};
+use subsplat_test_support::box_room::{colour, fisheye, panorama};
+use subsplat_test_support::pose_errors::relative_errors;
+
+const WIDTH: usize = 1024;
+
+/// Axes and positions of panoramas that look in different directions.
+fn places() -> [(DMat3, DVec3); 4] {
+    let axes = |yaw: f64, x: f64, z: f64| {
+        DMat3::from_rotation_y(yaw) * DMat3::from_rotation_x(x) * DMat3::from_rotation_z(z)
+    };
+    [
+        (axes(0.3, 0.02, 0.01), DVec3::new(-0.5, 0.1, -0.3)),
+        (axes(2.4, -0.03, 0.02), DVec3::new(0.1, 0.0, -0.1)),
+        (axes(-1.2, 0.01, -0.03), DVec3::new(0.5, 0.05, 0.4)),
+        (axes(0.9, 0.0, 0.02), DVec3::new(0.2, -0.1, 0.9)),
+    ]
+}
+
+fn true_camera((axes, position): (DMat3, DVec3), k: Intrinsics) -> Camera {
+    let pose = Mat4::from_mat3_translation(axes.as_mat3(), position.as_vec3());
+    Camera::new(k, pose).unwrap()
+}
+
+fn estimated(pictures: &[Rgb], projection: Projection) -> Result<EstimatedScene> {
+    let folder = tempfile::tempdir().unwrap();
+    let files: Vec<PathBuf> = (0..pictures.len())
+        .map(|i| {
+            let file = folder.path().join(format!("R{i}.png"));
+            save_png(&file, &pictures[i]).unwrap();
+            file
+        })
+        .collect();
+    let options = EstimateOptions { projection, ..EstimateOptions::default() };
+    let scene = estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(()))?;
+    check_frames(&scene, pictures.len());
+    Ok(scene)
+}
+
+/// The frames show what their cameras see, in the world of the estimate turned to that of the room; points lie
+/// where the frames show them.
+fn check_frames(found: &EstimatedScene, photographs: usize) {
+    let frames = &found.scene.frames;
+    let of_each = frames.len() / photographs;
+    let first = found.estimate.cameras[0].unwrap().rotation().as_dmat3();
+    let room_from_world = places()[0].0 * first.transpose();
+    for (i, frame) in frames.iter().enumerate() {
+        let (picture, camera) = frame.load().unwrap();
+        let (from, k) = (places()[i / of_each].1, camera.intrinsics());
+        let axes = room_from_world * camera.rotation().as_dmat3();
+        let (mut sum, mut count) = (0.0, 0.0);
+        for (p, pixel) in picture.data.chunks_exact(3).enumerate().step_by(7) {
+            let px = DVec2::new((p % k.width) as f64 + 0.5, (p / k.width) as f64 + 0.5);
+            let at = px - DVec2::new(k.cx.into(), k.cy.into());
+            let seen = colour(from, axes * (at / f64::from(k.fx)).extend(1.0));
+            sum += pixel.iter().zip(seen).map(|(a, b)| f64::from(a.abs_diff(b))).sum::<f64>() / 3.0;
+            count += 1.0;
+        }
+        assert!(sum / count < 6.0, "{}: {}", frame.name, sum / count);
+    }
+    let mut errors: Vec<f32> = Vec::new();
+    for (point, seen) in found.estimate.points.iter().zip(&found.observations) {
+        for (frame, px) in seen {
+            let at = frames[*frame].camera.project(point.position).unwrap();
+            errors.push(at.distance((*px).into()));
+        }
+    }
+    // Views of a panorama leave out what lies above 41 degrees.
+    let shared = found.observations.iter().filter(|seen| seen.len() >= 2).count();
+    assert!(10 * shared > 8 * found.observations.len(), "{shared}");
+    errors.sort_by(f32::total_cmp);
+    assert!(errors[errors.len() / 2] < 0.5, "{}", errors[errors.len() / 2]);
+    let visible: usize = frames.iter().map(|f| f.visible.len()).sum();
+    assert_eq!(visible, found.observations.iter().map(Vec::len).sum());
+}
+
+fn check_cameras(found: &EstimatedScene, turn: f64, direction: f64) {
+    assert_eq!(found.estimate.confidence, Confidence::High, "{:?}", found.estimate.warnings);
+    let cameras: Vec<Camera> = found.estimate.cameras.iter().map(|c| c.unwrap()).collect();
+    for (i, camera) in cameras.iter().enumerate().skip(1) {
+        let truth = [0, i].map(|i| true_camera(places()[i], camera.intrinsics()));
+        let errors = relative_errors([&cameras[0], camera], truth.each_ref());
+        assert!(errors[0] < turn && errors[1] < direction, "{i}: {errors:?}");
+    }
+}
+
+#[test]
+fn two_panoramas_get_their_cameras_and_twelve_frames() {
+    let pictures = [0, 1].map(|i| panorama(WIDTH, places()[i].1, places()[i].0));
+    let found = estimated(&pictures, Projection::Detected).unwrap();
+    check_cameras(&found, 0.1, 0.5);
+    assert_eq!(found.scene.frames.len(), 12);
+    assert_eq!(found.scene.frames[7].name, "R1_060");
+    assert_eq!(found.lenses, [LensSource::Panorama, LensSource::Panorama]);
+    let lines: Vec<&String> =
+        found.scene.warnings.iter().filter(|w| w.contains("edges continue each other")).collect();
+    assert_eq!(lines.len(), 2, "{:?}", found.scene.warnings);
+    // The two panoramas have views in the same directions.
+    for i in 0..6 {
+        let [a, b] = [i, i + 6].map(|i| found.scene.frames[i].camera.rotation());
+        assert_eq!(a, b);
+    }
+}
+
+#[test]
+fn four_panoramas_are_placed_together() {
+    let pictures = [0, 1, 2, 3].map(|i| panorama(WIDTH, places()[i].1, places()[i].0));
+    let found = estimated(&pictures, Projection::Panorama).unwrap();
+    check_cameras(&found, 0.1, 0.5);
+    assert_eq!(found.scene.frames.len(), 24);
+    assert!(
+        !found.scene.warnings.iter().any(|w| w.contains("edges")),
+        "{:?}",
+        found.scene.warnings
+    );
+}
+
+/// Two pictures of a circular fisheye lens, from steps of the first place.
+fn fisheyes(curve: FisheyeCurve, degrees: f64) -> [Rgb; 2] {
+    let half = 0.5 * degrees.to_radians();
+    let angle = move |r: f64| match curve {
+        FisheyeCurve::Equidistant => r * half,
+        FisheyeCurve::Equisolid => 2.0 * (r * (0.5 * half).sin()).asin(),
+        FisheyeCurve::Stereographic => 2.0 * (r * (0.5 * half).tan()).atan(),
+    };
+    [0, 1].map(|i| {
+        let (axes, from) = fisheye_place(i);
+        fisheye([900, 840], 400.0, from, axes, angle)
+    })
+}
+
+fn fisheye_place(i: usize) -> (DMat3, DVec3) {
+    let (axes, from) = places()[0];
+    let turn = DMat3::from_rotation_y(-0.15 * i as f64);
+    (axes * turn, from + axes * DVec3::new(0.4, 0.02, 0.1) * i as f64)
+}
+
+#[test]
+fn fisheye_pictures_are_cut_and_get_their_cameras() {
+    for (curve, degrees) in [(FisheyeCurve::Equidistant, 180.0), (FisheyeCurve::Equisolid, 200.0)] {
+        let folder = tempfile::tempdir().unwrap();
+        let files = ["a.png", "b.png"].map(|name| folder.path().join(name));
+        for (file, picture) in files.iter().zip(fisheyes(curve, degrees)) {
+            save_png(file, &picture).unwrap();
+        }
+        let lens = FisheyeLens { angle: f64::to_radians(degrees), curve };
+        let options =
+            EstimateOptions { projection: Projection::Fisheye(lens), ..EstimateOptions::default() };
+        let found =
+            estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
+        let cameras = [0, 1].map(|i| found.estimate.cameras[i].unwrap());
+        let truth = [0, 1].map(|i| true_camera(fisheye_place(i), cameras[i].intrinsics()));
+        let errors = relative_errors(cameras.each_ref(), truth.each_ref());
+        assert!(errors[0] < 0.2 && errors[1] < 1.5, "{curve:?}: {errors:?}");
+        assert_eq!(found.scene.frames[1].name, "b");
+        assert_eq!(found.lenses, [LensSource::Fisheye, LensSource::Fisheye]);
+        for (i, frame) in found.scene.frames.iter().enumerate() {
+            let (picture, camera) = frame.load().unwrap();
+            let k = camera.intrinsics();
+            let half = (0.5 * f64::from(k.fov_x())).to_degrees();
+            assert!((half - 45.0).abs() < 1.5, "{half}");
+            let (axes, from) = fisheye_place(i);
+            let middle = colour(from, axes.z_axis);
+            let at = 3 * ((k.height / 2) * k.width + k.width / 2);
+            for (a, b) in picture.data[at..at + 3].iter().zip(middle) {
+                assert!(a.abs_diff(b) < 25, "{a} {b}");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_a_picture_looks_like_is_said_where_the_cameras_fail() {
+    // The same picture twice has no cameras.
+    let [circle, _] = fisheyes(FisheyeCurve::Equidistant, 180.0);
+    let error = estimated(&[circle.clone(), circle], Projection::Detected).unwrap_err().to_string();
+    assert!(error.contains("same view") && error.contains("--lens fisheye"), "{error}");
+    // Two to one, with edges that do not meet.
+    let whole = panorama(4 * WIDTH, places()[0].1, places()[0].0);
+    let rows = whole.data.chunks_exact(12 * WIDTH).skip(600).take(512);
+    let data = rows.flat_map(|row| row[..3 * WIDTH].to_vec()).collect();
+    let part = Rgb { width: WIDTH, height: 512, data };
+    let error = estimated(&[part.clone(), part], Projection::Detected).unwrap_err().to_string();
+    assert!(error.contains("shape of a panorama") && error.contains("1 more"), "{error}");
+    // Neither is a panorama by force.
+    let square = panorama(WIDTH, places()[0].1, places()[0].0);
+    let square = Rgb { height: 300, data: square.data[..3 * WIDTH * 300].to_vec(), ..square };
+    let error = estimated(&[square.clone(), square], Projection::Panorama).unwrap_err().to_string();
+    assert!(error.contains("twice as wide as high") && error.contains("1024x300"), "{error}");
+}
