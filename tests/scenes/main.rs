@@ -3,9 +3,11 @@
 mod as_people_have_them;
 mod check;
 mod check_rendered;
+mod foreign_cameras;
 mod hostile_scenes;
 mod metrics;
 mod navigation;
+mod options;
 mod photographs;
 mod resize;
 mod scene_formats;

@@ -3,6 +3,7 @@
 use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderingArgs, RunArgs, SourceArgs};
 use super::frames::{self, DepthSpread};
 use super::html::Page;
+use super::info::print_left_out;
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
 use super::{memory, model, pair, render, video};
@@ -121,7 +122,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let video = video::finish(job.video.take(), &args.motion, answer)?;
     let inputs = progress.stage("inputs", |_| input_report(&result, &options))?;
     Done { model, result, options, scored, inputs, files, video }
-        .finish(args, &plan, progress, answer)
+        .finish(args, &plan, progress, answer)?;
+    print_left_out(&plan.scene);
+    Ok(())
 }
 
 /// Crop of the targets' photographs: that of the inputs, which all have one size.
@@ -207,7 +210,8 @@ pub fn photographs(
 /// the reason for the choice too.
 pub fn context(args: &SourceArgs, input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
     let (named, most) = (&args.context, args.photographs_max());
-    let list = |frames: &[usize]| frames.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
+    let entry = |&i: &usize| scene.frames[i].entry.to_string();
+    let list = |frames: &[usize]| frames.iter().map(entry).collect::<Vec<_>>().join(",");
     if !named.is_empty() {
         let chosen = frames::indices(scene, named, "--context")?;
         ensure!(
