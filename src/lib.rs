@@ -98,7 +98,8 @@ pub use crate::reconstruct::{
 };
 pub use files::photos::image::{LoadOptions, save_depth_png, save_png};
 pub use files::photos::photograph::{Photograph, load_photograph, parse_photograph};
-pub use files::poses::scene::{Frame, Scene, load_scene};
+pub use files::poses::reading::SceneOptions;
+pub use files::poses::scene::{Frame, Scene, load_scene, load_scene_with};
 pub use files::{
     Error as FileError, SaveOptions, SplatFormat, Up, encode_splats, load_splats, parse_splats,
     save_splats,

@@ -3,10 +3,12 @@
 mod as_people_have_them;
 mod check;
 mod check_rendered;
+mod foreign_cameras;
 mod hostile_scenes;
 mod lenses;
 mod metrics;
 mod navigation;
+mod options;
 mod photographs;
 mod resize;
 mod scene_formats;

@@ -24,6 +24,7 @@ use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 fn cameras_json_round_trips() {
     let (folder, mut cameras) = made_up(5);
     cameras[3].depth = Some("depth/003.png".to_owned());
+    cameras[2].mask = Some("keep/2.png".to_owned());
     for units in [Units::Unknown, Units::Metres, Units::RealEstate10k] {
         let path = folder.path().join("cameras.json");
         let content = CameraFile {

@@ -80,7 +80,8 @@ fn pose_readings(cameras: &[Camera; 2]) -> Vec<Reading> {
     let mut all = vec![
         reading(
             "opengl",
-            "their camera axes are read as OpenGL's (x right, y up, z back; nerfstudio, Blender)",
+            "the y and z axes of their cameras are turned round: the file has OpenGL's axes (x right, y up, \
+             z back; nerfstudio, Blender) where its format has OpenCV's, or the reverse",
             cameras,
             |c| posed(c, c.world_from_camera() * opengl()),
         ),

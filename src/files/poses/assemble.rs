@@ -1,8 +1,10 @@
 //! Common parts of the pose readers: search for pictures, reading of their headers, and
 //! conversion of a file's entries to checked [`Frame`]s.
 
+use super::notes::Notes;
 use super::panoramas::{self, DraftView};
-use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
+use super::reading::{Folders, Reading};
+use super::scene::{Frame, LeftOut, Pixels, Scene, SceneFormat, Units};
 use crate::files::photos::image::{Probe, probe};
 use crate::files::photos::masks;
 use crate::files::photos::undistort::Distortion;
@@ -20,6 +22,8 @@ pub(super) enum Lens {
     Pixels([f64; 4]),
     /// fx, fy, cx, cy divided by width and height of the picture.
     Normalised([f64; 4]),
+    /// One focal length in pixels of the stored picture; the principal point is its middle.
+    Centred(f64),
 }
 
 /// A frame before its picture's header is read.
@@ -93,6 +97,11 @@ pub(super) const EXTENSIONS: [&str; 18] = [
 /// copies as `images_4`. A name that differs in case, in the form of its accents or in the extension is found
 /// where it is the only one.
 pub(in crate::files) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
+    find_image_in(&Folders::default(), roots, name)
+}
+
+/// [`find_image`] among `folders`, which are listed once.
+pub(super) fn find_image_in(folders: &Folders, roots: &[&Path], name: &str) -> Option<PathBuf> {
     let name = name.replace('\\', "/");
     let name = name.trim_start_matches("./");
     if name.is_empty() {
@@ -106,34 +115,23 @@ pub(in crate::files) fn find_image(roots: &[&Path], name: &str) -> Option<PathBu
     candidates
         .next()
         .or_else(|| places.iter().flat_map(|p| with_extensions(p)).find(|p| p.is_file()))
-        .or_else(|| places.iter().find_map(|p| similar(p)))
-        .or_else(|| in_reduced_copies(roots, name))
+        .or_else(|| places.iter().find_map(|p| folders.similar(p)))
+        .or_else(|| in_reduced_copies(folders, roots, name))
         .or_else(|| places.iter().find(|p| p.exists()).cloned())
 }
 
 /// The picture among reduced copies, which COLMAP's and nerfstudio's scenes have in `images_2` to `images_8`.
-fn in_reduced_copies(roots: &[&Path], name: &str) -> Option<PathBuf> {
+fn in_reduced_copies(folders: &Folders, roots: &[&Path], name: &str) -> Option<PathBuf> {
     let name = name.trim_start_matches("images/");
     let copies = [2, 4, 8].map(|n| format!("images_{n}"));
     let places = roots.iter().flat_map(|r| copies.iter().map(|copy| r.join(copy).join(name)));
     let places: Vec<PathBuf> = places.collect();
     let found = places.iter().find(|p| p.is_file()).cloned();
-    found.or_else(|| places.iter().find_map(|p| similar(p)))
-}
-
-/// The only picture in the folder of `place` whose name is that of `place` but for case, the form of accents
-/// and the extension.
-fn similar(place: &Path) -> Option<PathBuf> {
-    let wanted = similar_key(place);
-    let mut all =
-        std::fs::read_dir(place.parent()?).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
-    let matches = |path: &PathBuf| has_extension(path) && similar_key(path) == wanted;
-    let found = all.by_ref().find(matches)?;
-    (!all.any(|path| matches(&path))).then_some(found)
+    found.or_else(|| places.iter().find_map(|p| folders.similar(p)))
 }
 
 /// A file's name without a picture's extension, in lower case and with composed accents.
-fn similar_key(path: &Path) -> String {
+pub(super) fn similar_key(path: &Path) -> String {
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let name: String = name.nfc().flat_map(char::to_lowercase).collect();
     match name.rsplit_once('.') {
@@ -273,6 +271,7 @@ fn stored_intrinsics(
 ) -> std::result::Result<StoredIntrinsics, Misfit> {
     let (w, h) = (stored.width as f64, stored.height as f64);
     let (k, rescaled) = match draft.lens {
+        Lens::Centred(focal) => ([focal, focal, 0.5 * w, 0.5 * h], false),
         Lens::Normalised(k) => ([k[0] * w, k[1] * h, k[2] * w, k[3] * h], false),
         Lens::Pixels(k) => {
             let (given_w, given_h) = draft.size.unwrap_or((stored.width, stored.height));
@@ -316,9 +315,10 @@ pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Err
 pub(super) fn assemble(
     path: &Path,
     source: SceneFormat,
-    pictures: Pictures,
+    reading: &Reading<'_>,
     mut drafts: Vec<Draft>,
 ) -> Result<Scene> {
+    let Reading { pictures, strict, .. } = *reading;
     if drafts.is_empty() {
         return Err(Error::format(path, "at least one frame", "none"));
     }
@@ -336,7 +336,7 @@ pub(super) fn assemble(
     let count = entries.len();
     let mut notes = Notes::default();
     let mut frames: Vec<Frame> = Vec::with_capacity(count);
-    for (mut draft, stored) in entries {
+    for (entry, (mut draft, stored)) in entries.into_iter().enumerate() {
         let file = draft.file.clone();
         let made = match (draft.refused.take(), stored) {
             (Some(error), _) | (None, Some(Err(error))) => Err(error),
@@ -345,14 +345,24 @@ pub(super) fn assemble(
                 frame(path, draft, image, &stored, &mut notes)
             }
             (None, None) => {
-                notes.missing.push(file);
+                notes.miss(entry, file);
                 continue;
             }
         };
         match made {
-            Ok(frame) => frames.push(frame),
-            Err(error) => notes.refuse(&file, error),
+            Ok(mut frame) => {
+                frame.entry = entry;
+                if let Some(got) = &frame.other_shape {
+                    let reason = format!("a picture of another shape than the camera's: {got}");
+                    notes.left_out.push(LeftOut { entry, name: file, reason });
+                }
+                frames.push(frame);
+            }
+            Err(error) => notes.refuse(entry, &file, error),
         }
+    }
+    if strict && let Some(error) = notes.strict_error(path, count) {
+        return Err(error);
     }
     if source == SceneFormat::Photographs {
         // The photographs' loader has said so.
@@ -392,6 +402,7 @@ pub(super) fn assemble(
         near_far: None,
         origin,
         warnings,
+        left_out: notes.left_out,
     })
 }
 
@@ -485,6 +496,7 @@ fn frame(
     let label = view.as_ref().map_or("", |view| &view.label);
     Ok(Frame {
         name: frame_name(&draft.file) + label,
+        entry: 0,
         image,
         pixels: draft.pixels,
         camera,
@@ -538,68 +550,8 @@ pub(super) fn frame_name(file: &str) -> String {
     }
 }
 
-/// Files that give warnings, one line for each kind.
-#[derive(Default)]
-struct Notes {
-    /// Entries without a frame, with the reason.
-    refused: Vec<String>,
-    /// Error of the first of them.
-    refused_error: Option<Error>,
-    missing: Vec<String>,
-    other_shape: Vec<String>,
-    /// Error of the first frame of `other_shape`.
-    other_shape_error: Option<Error>,
-    with_orientation: Vec<String>,
-    rescaled: Vec<String>,
-    skewed: Vec<String>,
-    unmasked: Vec<String>,
-}
-
-impl Notes {
-    fn refuse(&mut self, file: &str, error: Error) {
-        let reason = match &error {
-            Error::Format { path, at, expected, got } => {
-                let name = path.file_name().unwrap_or_default().to_string_lossy();
-                let place = if at.is_empty() { String::new() } else { format!("{name}{at}: ") };
-                format!("{place}expected {expected}, got {got}")
-            }
-            Error::Io { source, .. } => source.to_string(),
-        };
-        self.refused.push(format!("{file} ({reason})"));
-        self.refused_error.get_or_insert(error);
-    }
-
-    fn lines(&self, count: usize) -> Vec<String> {
-        let kinds = [
-            (&self.refused, "are left out"),
-            (&self.missing, "have no picture on disk and are left out"),
-            (
-                &self.other_shape,
-                "have pictures of another shape than the cameras' and cannot be used",
-            ),
-            (
-                &self.with_orientation,
-                "have an EXIF orientation: ignored, pose files refer to the stored pixels",
-            ),
-            (&self.rescaled, "are stored at another size than the pose file's: intrinsics scaled"),
-            (&self.skewed, "have a rotation that is not orthonormal (0.1 % to 1 %): corrected"),
-            (
-                &self.unmasked,
-                "have a mask that is missing, cannot be read or has another shape: all of their \
-                 pixels are used",
-            ),
-        ];
-        let line = |(files, what): (&Vec<String>, &str)| {
-            let few: Vec<&str> = files.iter().take(3).map(String::as_str).collect();
-            let more = if files.len() > 3 { ", …" } else { "" };
-            format!("{} of {count} frames {what}: {}{more}", files.len(), few.join(", "))
-        };
-        kinds.into_iter().filter(|(files, _)| !files.is_empty()).map(line).collect()
-    }
-}
-
 /// Derives the scene's name from the nearest folder that is not part of a format's layout.
-fn scene_name(pose_file: &Path) -> String {
+pub(super) fn scene_name(pose_file: &Path) -> String {
     let absolute = std::fs::canonicalize(pose_file).unwrap_or_else(|_| pose_file.to_owned());
     let mut folder = if absolute.is_dir() { Some(absolute.as_path()) } else { absolute.parent() };
     while let Some(f) = folder {

@@ -9,7 +9,7 @@
 //! ```
 //!
 //! `c2w` is OpenCV camera-to-world; intrinsics are in pixels of the stored picture, without
-//! distortion. Optional keys of a frame are `timestamp_us`, `depth`, and `pixels`: `"upright"`
+//! distortion. Optional keys of a frame are `timestamp_us`, `depth`, `mask` (a grey picture, 0 is masked), and `pixels`: `"upright"`
 //! if the camera refers to the picture with its EXIF orientation applied (default: `"stored"`).
 //! Optional keys of the file are `units` (`metres`, `re10k`) or `metric: true`, `near` and `far` (camera z in
 //! world units, for all frames), and `points`, a list of `[x, y, z]` of sparse points. Unknown
@@ -18,10 +18,9 @@
 //! The list of 3DGS has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (of the camera): the same axes, principal point in the middle.
 
-use super::assemble::{
-    Draft, Lens, Pictures, assemble, camera_error, find_image, origin_of, orthonormal,
-};
+use super::assemble::{Draft, Lens, assemble, camera_error, origin_of, orthonormal};
 use super::json;
+use super::reading::Reading;
 use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
 use crate::files::{Error, Result, read, write_atomic};
 use glam::{DMat4, DVec3, DVec4, Vec3};
@@ -49,6 +48,8 @@ pub struct NamedCamera {
     pub timestamp: Option<i64>,
     /// Path of the depth map, relative to the folder of the file.
     pub depth: Option<String>,
+    /// Path of the mask, relative to the folder of the file ([`Frame::mask`]).
+    pub mask: Option<String>,
 }
 
 /// Content of a `cameras.json`.
@@ -102,6 +103,7 @@ struct InFrame {
     timestamp_us: Option<i64>,
     re10k_frame: Option<i64>,
     depth: Option<String>,
+    mask: Option<String>,
     pixels: Option<String>,
 }
 
@@ -140,6 +142,8 @@ struct OutFrame<'a> {
     pixels: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     depth: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mask: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     timestamp_us: Option<i64>,
     width: usize,
@@ -188,8 +192,7 @@ fn has_this_layout(path: &Path) -> Result<bool> {
 
 fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
     let bytes = read(path)?;
-    let list = bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[');
-    if list {
+    if json::is_list(&bytes) {
         let frames: Vec<SplatFrame> =
             json::parse(path, &bytes, "a list of 3DGS cameras (img_name, rotation, …)")?;
         let drafts = frames.into_iter().enumerate().map(|(i, f)| {
@@ -253,9 +256,9 @@ fn draft(path: &Path, index: usize, f: InFrame) -> Result<Draft> {
             return Err(Error::format(path, expected, format!("`{other}`")).at(place));
         }
     };
-    let depth = f.depth.map(|d| folder(path).join(d));
+    let [depth, mask] = [f.depth, f.mask].map(|file| file.map(|file| folder(path).join(file)));
     let draft = Draft::new(place, f.file, lens, pose);
-    Ok(Draft { size, pixels, timestamp: f.timestamp_us, depth, ..draft })
+    Ok(Draft { size, pixels, timestamp: f.timestamp_us, depth, mask, ..draft })
 }
 
 fn splat_draft(path: &Path, index: usize, f: SplatFrame) -> Result<Draft> {
@@ -274,12 +277,12 @@ fn folder(path: &Path) -> &Path {
 }
 
 /// Reads a scene. Frames without a picture are left out with a warning.
-pub(super) fn load(path: &Path, pictures: Pictures) -> Result<Scene> {
+pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let (mut drafts, info) = drafts(path)?;
     for d in &mut drafts {
-        d.image = find_image(&[folder(path)], &d.file);
+        d.image = reading.find(&[folder(path)], &d.file);
     }
-    let mut scene = assemble(path, SceneFormat::CamerasJson, pictures, drafts)?;
+    let mut scene = assemble(path, SceneFormat::CamerasJson, reading, drafts)?;
     scene.units = info.units;
     scene.near_far = info.near_far;
     scene.points =
@@ -312,12 +315,12 @@ fn read_cameras(path: &Path) -> Result<CameraFile> {
 
         let camera = Camera::new(intrinsics, pose.as_mat4())
             .map_err(|e| camera_error(path, &d.place, &e))?;
-        let depth = d
-            .depth
-            .as_deref()
-            .map(|p| p.strip_prefix(folder(path)).unwrap_or(p).to_string_lossy().into_owned());
+        let inside = |p: std::path::PathBuf| {
+            p.strip_prefix(folder(path)).unwrap_or(&p).to_string_lossy().into_owned()
+        };
+        let (depth, mask) = (d.depth.map(inside), d.mask.map(inside));
         let (file, pixels, timestamp) = (d.file, d.pixels, d.timestamp);
-        cameras.push(NamedCamera { file, pixels, camera, timestamp, depth });
+        cameras.push(NamedCamera { file, pixels, camera, timestamp, depth, mask });
     }
     let FileInfo { units, near_far, origin, .. } = info;
     Ok(CameraFile { cameras, units, near_far, origin: origin + moved })
@@ -353,10 +356,10 @@ fn write_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) 
     let frames = content.cameras.iter().map(|c| {
         let (fx, fy, cx, cy, width, height, c2w) = frame(c);
         let file = c.file.as_str();
-        let depth = c.depth.as_deref();
+        let (depth, mask) = (c.depth.as_deref(), c.mask.as_deref());
         let timestamp_us = c.timestamp;
         let pixels = (c.pixels == Pixels::Upright).then_some(UPRIGHT);
-        OutFrame { file, pixels, depth, timestamp_us, width, height, fx, fy, cx, cy, c2w }
+        OutFrame { file, pixels, depth, mask, timestamp_us, width, height, fx, fy, cx, cy, c2w }
     });
     let units = match content.units {
         Units::Unknown => None,
@@ -374,10 +377,11 @@ fn write_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) 
 }
 
 impl NamedCamera {
-    /// Makes a named camera of a stored picture at the path `file`, without time stamp and
-    /// depth map.
+    /// Makes a named camera of a stored picture at the path `file`, without time stamp,
+    /// depth map and mask.
     pub fn new(file: impl Into<String>, camera: Camera) -> Self {
-        Self { file: file.into(), pixels: Pixels::Stored, camera, timestamp: None, depth: None }
+        let (file, pixels) = (file.into(), Pixels::Stored);
+        Self { file, pixels, camera, timestamp: None, depth: None, mask: None }
     }
 
     /// Makes a named camera of a frame's camera and the new path `file` of its picture. A file

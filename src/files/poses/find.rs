@@ -1,13 +1,17 @@
 //! The scene of a folder: every pose file in it, or one level below, by content. The first kind of this
-//! list that a folder has is read, of several COLMAP models the largest; a line names what is not read.
+//! list that a folder has is read, of several COLMAP models the largest. A line names the others of the same
+//! kind, and those of another kind with more cameras.
 //!
 //! 1. `cameras.json`, `transforms.json`, `transforms_train.json` (NeRF's synthetic scenes)
 //! 2. COLMAP models in `sparse`, `colmap/sparse`, the folder itself and `dense`, and in their numbered folders
 //! 3. a RealEstate10K txt
 //! 4. `poses.txt` with `K.txt`
+//! 5. the cameras of OpenSfM, Polycam, Record3D, Bundler and LLFF
+//! 6. a list of `ns-export cameras` where the pictures state their focal lengths
+//! 7. a JSON file of any other name with the content of one of the files above
 
-use super::assemble::entries;
-use super::{colmap, re10k};
+use super::assemble::{entries, files};
+use super::{bundler, colmap, llff, nerfstudio, opensfm, polycam, re10k};
 use crate::files::photos::photograph::list_photographs;
 use crate::files::{Result, read};
 use std::path::{Path, PathBuf};
@@ -23,17 +27,16 @@ const JSON_FILES: [&str; 5] = [
 /// Folders in which COLMAP models may lie, themselves or in numbered folders of theirs.
 const MODEL_FOLDERS: [&str; 4] = ["sparse", "colmap/sparse", "", "dense"];
 /// Cameras in layouts that are not read: file or folder, and its maker.
-const NOT_READ: [(&str, &str); 9] = [
-    ("keyframes/corrected_cameras", "Polycam's raw data"),
-    ("keyframes/cameras", "Polycam's raw data"),
-    ("corrected_cameras", "Polycam's raw data"),
-    ("poses_bounds.npy", "LLFF's poses"),
-    ("reconstruction.json", "OpenSfM's reconstruction"),
-    ("bundle.out", "Bundler's cameras"),
-    ("metadata.json", "Record3D's metadata"),
-    ("camera_path.json", "a path of nerfstudio's viewer"),
+const NOT_READ: [(&str, &str); 2] = [
+    ("camera_path.json", "a path of nerfstudio's viewer, which has no photographs"),
     ("project.files", "a Metashape project"),
 ];
+/// Files of Bundler, from the folder of the scene.
+const BUNDLER_FILES: [&str; 3] = ["bundle.out", "bundle/bundle.out", "bundler/bundle.out"];
+/// Files of OpenSfM, from the folder of the scene: its own, and OpenDroneMap's.
+const OPENSFM_FILES: [&str; 2] = ["reconstruction.json", "opensfm/reconstruction.json"];
+/// Most JSON files of any name that are read in search of cameras, and the size of the largest, bytes.
+const JSON_MAX: (usize, u64) = (40, 1 << 26);
 /// Most folders that are searched one level below.
 const FOLDERS_MAX: usize = 200;
 /// File that `subsplat run` writes beside the pictures that it renders, and words that it has.
@@ -51,6 +54,18 @@ pub(super) enum PoseFile {
     Re10k(PathBuf),
     /// Folder of `poses.txt`.
     Matrices(PathBuf),
+    /// `reconstruction.json` of OpenSfM.
+    OpenSfm(PathBuf),
+    /// Folder of Polycam's key frames.
+    Polycam(PathBuf),
+    /// Metadata of Record3D.
+    Record3d(PathBuf),
+    /// `bundle.out` of Bundler.
+    Bundler(PathBuf),
+    /// `poses_bounds.npy` of LLFF.
+    Llff(PathBuf),
+    /// List or path of nerfstudio.
+    Nerfstudio(PathBuf),
 }
 
 impl PoseFile {
@@ -60,6 +75,14 @@ impl PoseFile {
             Self::Json(path) => cameras_of_json(path, true).unwrap_or(0),
             Self::Colmap(folder) => colmap::count_images(folder),
             Self::Re10k(_) | Self::Matrices(_) => 0,
+            Self::OpenSfm(path) => value_of(path).map_or(0, |value| opensfm::count(&value)),
+            Self::Polycam(folder) => polycam::count(folder),
+            Self::Record3d(path) => length_of(path, "poses"),
+            Self::Bundler(path) => bundler::count(path),
+            Self::Llff(path) => llff::count(path),
+            Self::Nerfstudio(path) => {
+                cameras_of_json(path, true).unwrap_or_else(|| length_of(path, "camera_path"))
+            }
         }
     }
 
@@ -68,6 +91,8 @@ impl PoseFile {
             Self::Json(path) | Self::Colmap(path) | Self::Re10k(path) | Self::Matrices(path) => {
                 path
             }
+            Self::OpenSfm(path) | Self::Polycam(path) | Self::Record3d(path) => path,
+            Self::Bundler(path) | Self::Llff(path) | Self::Nerfstudio(path) => path,
         }
     }
 }
@@ -132,7 +157,11 @@ pub(super) fn find_in(folder: &Path) -> Result<Option<Found>> {
     let mut own = candidates(folder)?.into_iter();
     let Some(first) = own.next() else { return Ok(None) };
     // Another format usually has the same cameras.
-    let others = own.filter(|other| other.part == first.part).collect();
+    let others: Vec<Candidate> = own.collect();
+    let count = if others.is_empty() { 0 } else { first.file.cameras() };
+    let worth_a_line =
+        |other: &Candidate| other.part == first.part || (count > 0 && other.file.cameras() > count);
+    let others = others.into_iter().filter(worth_a_line).collect();
     Ok(Some(chosen(folder, first, others)))
 }
 
@@ -142,10 +171,7 @@ pub fn not_read(folder: impl AsRef<Path>) -> Option<String> {
 }
 
 fn cameras_not_read(folder: &Path) -> Option<String> {
-    let is_list = |file: &str| {
-        let start = read(folder.join(file)).unwrap_or_default();
-        start.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[')
-    };
+    let is_list = |file: &str| super::json::is_list(&read(folder.join(file)).unwrap_or_default());
     let there = NOT_READ
         .iter()
         .find(|(path, _)| folder.join(path).exists())
@@ -203,7 +229,97 @@ fn candidates(folder: &Path) -> Result<Vec<Candidate>> {
     if folder.join("poses.txt").is_file() {
         add(PoseFile::Matrices(folder.to_owned()), Part::Whole("poses.txt"));
     }
+    foreign(folder).into_iter().for_each(|(file, name)| add(file, Part::Whole(name)));
+    if all.is_empty() {
+        let file = any_json(folder).map(|file| Candidate { file, part: Part::Whole("json") });
+        all.extend(file);
+    }
     Ok(all)
+}
+
+/// Cameras of other programs in a folder, each with the name of its kind.
+fn foreign(folder: &Path) -> Vec<(PoseFile, &'static str)> {
+    let mut all = Vec::new();
+    let paths = OPENSFM_FILES.map(|name| folder.join(name));
+    if let Some(path) = paths.into_iter().find(|p| is_kind(p, &PoseFile::OpenSfm)) {
+        all.push((PoseFile::OpenSfm(path), "OpenSfM"));
+    }
+    if polycam::count(folder) > 0 {
+        all.push((PoseFile::Polycam(folder.to_owned()), "Polycam"));
+    }
+    let paths = ["metadata.json", "metadata"].map(|name| folder.join(name));
+    if let Some(path) = paths.into_iter().find(|p| is_kind(p, &PoseFile::Record3d)) {
+        all.push((PoseFile::Record3d(path), "Record3D"));
+    }
+    let paths = BUNDLER_FILES.map(|name| folder.join(name));
+    if let Some(path) = paths.into_iter().find(|path| path.is_file()) {
+        all.push((PoseFile::Bundler(path), "Bundler"));
+    }
+    let path = folder.join("poses_bounds.npy");
+    if path.is_file() {
+        all.push((PoseFile::Llff(path), "LLFF"));
+    }
+    let lists = JSON_FILES[1..].iter().map(|name| folder.join(name));
+    let mut lists = lists.filter(|path| is_kind(path, &PoseFile::Nerfstudio));
+    if let Some(path) = lists.find(|path| nerfstudio::has_focal_lengths(path)) {
+        all.push((PoseFile::Nerfstudio(path), "nerfstudio"));
+    }
+    all
+}
+
+/// Reports whether `path` is a JSON file of the kind `make`.
+fn is_kind(path: &Path, make: &dyn Fn(PathBuf) -> PoseFile) -> bool {
+    path.is_file() && foreign_json(path) == Some(make(path.to_owned()))
+}
+
+/// The kind of a JSON file of OpenSfM, Record3D or nerfstudio's exports, by content.
+pub(super) fn foreign_json(path: &Path) -> Option<PoseFile> {
+    let value = value_of(path)?;
+    let (first, path) = (value.get(0), path.to_owned());
+    let first_has = |key: &str| first.is_some_and(|first| first.get(key).is_some());
+    if first_has("cameras") && first_has("shots") {
+        return Some(PoseFile::OpenSfm(path));
+    }
+    if (first_has("transform") && first_has("file_path")) || value.get("camera_path").is_some() {
+        return Some(PoseFile::Nerfstudio(path));
+    }
+    let record3d = value.get("K").is_some() && value.get("poses").is_some();
+    record3d.then_some(PoseFile::Record3d(path))
+}
+
+/// A JSON file of any name with cameras and photographs: of several the one with most.
+fn any_json(folder: &Path) -> Option<PoseFile> {
+    let (most, largest) = JSON_MAX;
+    let mut all = files(folder);
+    all.retain(|path| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")));
+    all.retain(|path| path.metadata().is_ok_and(|file| file.len() <= largest));
+    let mut found: Vec<PoseFile> =
+        all.iter().take(most).filter_map(|path| kind_of_json(path)).collect();
+    // A stable order: of several with as many cameras the first.
+    found.sort_by_cached_key(|file| std::cmp::Reverse(file.cameras()));
+    found.into_iter().next()
+}
+
+fn kind_of_json(path: &Path) -> Option<PoseFile> {
+    match foreign_json(path) {
+        Some(PoseFile::Nerfstudio(_)) => return None,
+        Some(file) => return Some(file),
+        None => {}
+    }
+    let value = value_of(path)?;
+    let first = value.get("frames")?.get(0)?;
+    let is_frame = first.get("transform_matrix").is_some() || first.get("c2w").is_some();
+    is_frame.then(|| PoseFile::Json(path.to_owned()))
+}
+
+fn value_of(path: &Path) -> Option<serde_json::Value> {
+    super::json::value(&read(path).ok()?).ok()
+}
+
+/// Length of the list `key` of a JSON file, 0 where there is none.
+fn length_of(path: &Path, key: &str) -> usize {
+    let value = value_of(path);
+    value.as_ref().and_then(|v| v.get(key)?.as_array()).map_or(0, Vec::len)
 }
 
 /// COLMAP models in `base`: itself, and those of its numbered folders where it is not the scene's own
@@ -222,7 +338,7 @@ fn models(base: &Path, alone: bool) -> Vec<PathBuf> {
 
 /// Number of cameras of a JSON file: of an object with frames, or of a list where `lists`.
 fn cameras_of_json(path: &Path, lists: bool) -> Option<usize> {
-    let value = super::json::value(&read(path).ok()?).ok()?;
+    let value = value_of(path)?;
     let frames = value.get("frames").and_then(|frames| frames.as_array());
     frames.or(value.as_array().filter(|_| lists)).map(Vec::len)
 }

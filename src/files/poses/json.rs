@@ -1,4 +1,5 @@
-//! JSON as programs write it: with a byte order mark, and with `NaN` and `Infinity`, which JSON lacks.
+//! JSON as programs write it: with a byte order mark, in UTF-16 (PowerShell's `>`), and with `NaN` and
+//! `Infinity`, which JSON lacks.
 
 use super::super::{Error, Result};
 use serde::de::DeserializeOwned;
@@ -8,6 +9,8 @@ use std::path::Path;
 
 /// UTF-8's byte order mark.
 const MARK: &[u8] = b"\xEF\xBB\xBF";
+/// UTF-16's byte order marks, little-endian and big-endian.
+const MARKS_16: [&[u8]; 2] = [b"\xFF\xFE", b"\xFE\xFF"];
 /// Numbers that JSON lacks, as Python and C++ write them.
 const NOT_NUMBERS: [&str; 6] = ["-Infinity", "Infinity", "-inf", "inf", "NaN", "nan"];
 
@@ -22,6 +25,19 @@ pub(super) fn parse<T: DeserializeOwned>(path: &Path, bytes: &[u8], expected: &s
 /// Any JSON.
 pub(super) fn value(bytes: &[u8]) -> serde_json::Result<serde_json::Value> {
     serde_json::from_slice(&clean(bytes))
+}
+
+/// Reports whether JSON is a list.
+pub(super) fn is_list(bytes: &[u8]) -> bool {
+    utf8(bytes).iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[')
+}
+
+/// Deserializes numbers; what is no number in JSON is not a number.
+pub(super) fn numbers<'de, D: Deserializer<'de>>(
+    from: D,
+) -> std::result::Result<Vec<f64>, D::Error> {
+    let row = Vec::<Option<f64>>::deserialize(from)?;
+    Ok(row.into_iter().map(|v| v.unwrap_or(f64::NAN)).collect())
 }
 
 /// Deserializes rows of numbers; what is no number in JSON is not a number.
@@ -46,9 +62,28 @@ pub(super) fn error(path: &Path, expected: &str, error: &serde_json::Error) -> E
     Error::format(path, expected, got).at(at)
 }
 
+/// `bytes` in UTF-8 without a byte order mark. UTF-16 is known by its mark.
+pub(super) fn utf8(bytes: &[u8]) -> Cow<'_, [u8]> {
+    let [little, big] = MARKS_16.map(|mark| bytes.strip_prefix(mark));
+    let (rest, unit): (&[u8], fn([u8; 2]) -> u16) = match (little, big) {
+        (Some(rest), _) => (rest, u16::from_le_bytes),
+        (None, Some(rest)) => (rest, u16::from_be_bytes),
+        (None, None) => return Cow::Borrowed(bytes.strip_prefix(MARK).unwrap_or(bytes)),
+    };
+    let units: Vec<u16> = rest.chunks_exact(2).map(|pair| unit([pair[0], pair[1]])).collect();
+    Cow::Owned(String::from_utf16_lossy(&units).into_bytes())
+}
+
 /// `bytes` without a byte order mark, and with `null` for numbers that JSON lacks.
 fn clean(bytes: &[u8]) -> Cow<'_, [u8]> {
-    let bytes = bytes.strip_prefix(MARK).unwrap_or(bytes);
+    match utf8(bytes) {
+        Cow::Borrowed(bytes) => without_words(bytes),
+        Cow::Owned(bytes) => Cow::Owned(without_words(&bytes).into_owned()),
+    }
+}
+
+/// `bytes` with `null` for numbers that JSON lacks.
+fn without_words(bytes: &[u8]) -> Cow<'_, [u8]> {
     let mut out = Vec::new();
     let (mut in_string, mut at, mut copied) = (false, 0, 0);
     while let Some(byte) = bytes.get(at) {
@@ -90,5 +125,19 @@ mod tests {
         assert!(value[0][0] == 1.0 && value[0][1].is_nan());
         let e = parse::<f64>(Path::new("a.json"), b" \nNaN", "a number").unwrap_err().to_string();
         assert!(e.starts_with("a.json:2:") && e.contains("NaN"), "{e}");
+    }
+
+    #[test]
+    fn utf_16_is_read_by_its_mark() {
+        let text = "\u{feff}[\"K\u{fc}che\", NaN]";
+        let little: Vec<u8> = text.encode_utf16().flat_map(u16::to_le_bytes).collect();
+        let big: Vec<u8> = text.encode_utf16().flat_map(u16::to_be_bytes).collect();
+        for bytes in [text.as_bytes(), &little, &big] {
+            let expected = serde_json::json!(["K\u{fc}che", null]);
+            assert_eq!(value(bytes).unwrap(), expected);
+            assert!(is_list(bytes));
+        }
+        // Half a unit at the end is left out; half a pair is one character.
+        assert_eq!(&*utf8(b"\xFF\xFE1\0\x00\xD8 "), "1\u{fffd}".as_bytes());
     }
 }

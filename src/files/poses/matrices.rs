@@ -4,7 +4,8 @@
 //!
 //! White space, commas and brackets separate numbers; `#` begins a comment.
 
-use super::assemble::{Draft, Lens, Pictures, assemble, list_images};
+use super::assemble::{Draft, Lens, Pictures, assemble};
+use super::reading::{Reading, SceneOptions};
 use super::scene::{Scene, SceneFormat};
 use super::transforms::opengl_to_opencv;
 use crate::files::{Error, Result, read};
@@ -90,10 +91,12 @@ fn text(path: &Path) -> Result<String> {
 /// A file that is missing or malformed (the error names the line); a number of pictures that
 /// is not the number of poses.
 pub fn load(folder: impl AsRef<Path>, convention: PoseConvention) -> Result<Scene> {
-    load_folder(folder.as_ref(), convention)
+    let options = SceneOptions { convention: Some(convention), ..SceneOptions::default() };
+    load_with(folder.as_ref(), &Reading::with(Pictures::Needed, &options, None))
 }
 
-fn load_folder(folder: &Path, convention: PoseConvention) -> Result<Scene> {
+/// Reads a folder as [`load`] does, with the options of `reading`.
+pub(super) fn load_with(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let (poses_path, k_path) = (folder.join("poses.txt"), folder.join("K.txt"));
     let k = parse_intrinsics(&text(&k_path)?)
         .map_err(|got| Error::format(&k_path, "a 3x3 intrinsic matrix, or fx fy cx cy", got))?;
@@ -106,9 +109,9 @@ fn load_folder(folder: &Path, convention: PoseConvention) -> Result<Scene> {
         let matrix = parse_matrix(line).map_err(|got| {
             Error::format(&poses_path, "a pose of 12 or 16 numbers", got).at(&place)
         })?;
-        poses.push((place, convention.to_world_from_camera(matrix)));
+        poses.push((place, reading.pose(matrix, PoseConvention::default())));
     }
-    let images = list_images(&folder.join("images"));
+    let images = reading.list(&[folder.join("images")]);
     if images.len() != poses.len() {
         let expected = format!("{} pictures in images/, one for each pose", poses.len());
         return Err(Error::format(&poses_path, expected, images.len().to_string()));
@@ -117,5 +120,5 @@ fn load_folder(folder: &Path, convention: PoseConvention) -> Result<Scene> {
         let file = image.file_name().unwrap_or_default().to_string_lossy().into_owned();
         Draft { image: Some(image), ..Draft::new(place, file, Lens::Pixels(k), pose) }
     });
-    assemble(&poses_path, SceneFormat::Matrices, Pictures::Needed, drafts.collect())
+    assemble(&poses_path, SceneFormat::Matrices, &reading.needed(), drafts.collect())
 }

@@ -1,13 +1,21 @@
 //! Cameras of photographs, in every layout that is read or written.
 
 pub(super) mod assemble;
+pub mod bundler;
 pub mod cameras_json;
 pub mod colmap;
 pub mod find;
 mod json;
+pub mod llff;
 pub mod matrices;
+mod nerfstudio;
+mod notes;
+mod opensfm;
 pub(in crate::files) mod panoramas;
+mod polycam;
 pub mod protocol;
 pub mod re10k;
+pub mod reading;
+mod record3d;
 pub mod scene;
 pub mod transforms;

@@ -14,7 +14,8 @@
 //! 3. by order, if there are as many as lines (numbers in names in numeric order);
 //! 4. by time stamp, if some names are time stamps.
 
-use super::assemble::{Draft, Lens, Pictures, assemble, list_images};
+use super::assemble::{Draft, Lens, assemble};
+use super::reading::Reading;
 use super::scene::{Scene, SceneFormat, Units};
 use crate::files::{Error, Result, read};
 use glam::{DMat4, DVec4};
@@ -118,7 +119,7 @@ pub(super) fn find(folder: &Path) -> Result<Option<PathBuf>> {
 }
 
 /// Reads a camera file and finds its frames.
-pub(super) fn load(path: &Path) -> Result<Scene> {
+pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let mut warnings = Vec::new();
     let cameras = parse(path, &read(path)?, &mut warnings)?;
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -128,7 +129,7 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
         folder.join(path.file_stem().unwrap_or_default()),
         folder.to_owned(),
     ];
-    let images = places.iter().map(|p| list_images(p)).find(|l| !l.is_empty()).unwrap_or_default();
+    let images = reading.list(&places);
     if images.is_empty() {
         let expected = format!("pictures in {} or {}", places[0].display(), places[1].display());
         return Err(Error::format(path, expected, "none"));
@@ -141,7 +142,8 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
         let draft = Draft::new(place, file, Lens::Normalised(c.normalised), c.world_from_camera);
         Some(Draft { image: Some(image), timestamp: Some(c.timestamp), ..draft })
     });
-    let mut scene = assemble(path, SceneFormat::RealEstate10k, Pictures::Needed, drafts.collect())?;
+    let mut scene =
+        assemble(path, SceneFormat::RealEstate10k, &reading.needed(), drafts.collect())?;
     scene.units = Units::RealEstate10k;
     warnings.append(&mut scene.warnings);
     scene.warnings = warnings;

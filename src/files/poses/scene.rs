@@ -2,8 +2,8 @@
 //!
 //! A [`Scene`] has OpenCV cameras (`world_from_camera`) and intrinsics in pixels of the
 //! stored picture, pixel centres at +0.5 (`camera.rs`), in every format. The precedence of
-//! pose files in a folder is: `cameras.json`, `transforms.json`, COLMAP, RealEstate10K txt,
-//! `poses.txt` with `K.txt`. The path of a pose file selects that file.
+//! pose files in a folder is that of the module [`super::find`]. The path of a pose file selects that file, as
+//! does [`SceneOptions::model`].
 //!
 //! Pose files refer to the stored pixels ([`Pixels::Stored`]): EXIF orientation is not applied,
 //! and a picture with one gives a warning. Cameras of photographs without a pose file refer to
@@ -12,7 +12,11 @@
 use super::assemble::{self, Draft, Lens, Pictures, assemble};
 use super::find::{Found, PoseFile, find, find_in, not_read};
 use super::panoramas::DraftView;
-use super::{cameras_json, colmap, matrices, re10k, transforms};
+use super::reading::{Reading, SceneOptions};
+use super::{
+    bundler, cameras_json, colmap, find, llff, matrices, nerfstudio, opensfm, polycam, re10k,
+    record3d, transforms,
+};
 use crate::files::photos::image::{LoadOptions, LoadedPicture, load_with, probe};
 use crate::files::photos::masks;
 use crate::files::photos::photograph::{Photograph, load_photograph, load_photograph_or_panorama};
@@ -39,6 +43,18 @@ pub enum SceneFormat {
     RealEstate10k,
     /// `poses.txt` with `K.txt`.
     Matrices,
+    /// OpenSfM's `reconstruction.json`.
+    OpenSfm,
+    /// Polycam's raw data.
+    Polycam,
+    /// Record3D's metadata.
+    Record3d,
+    /// Bundler's `bundle.out`.
+    Bundler,
+    /// LLFF's `poses_bounds.npy`.
+    Llff,
+    /// A list of poses of `ns-export cameras`, or a path of nerfstudio's viewer.
+    Nerfstudio,
     /// Two pictures with cameras from the command line.
     Pair,
     /// Photographs whose cameras were estimated from the photographs alone.
@@ -54,6 +70,12 @@ impl SceneFormat {
             Self::Colmap => "COLMAP",
             Self::RealEstate10k => "RealEstate10K txt",
             Self::Matrices => "poses.txt with K.txt",
+            Self::OpenSfm => "OpenSfM",
+            Self::Polycam => "Polycam's raw data",
+            Self::Record3d => "Record3D",
+            Self::Bundler => "Bundler",
+            Self::Llff => "LLFF's poses_bounds.npy",
+            Self::Nerfstudio => "nerfstudio's list of cameras",
             Self::Pair => "two pictures with given cameras",
             Self::Photographs => "photographs with estimated cameras",
         }
@@ -90,6 +112,8 @@ pub enum Pixels {
 /// One posed photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
+    /// Index of the entry in the pose file's order (COLMAP: by name), those that are left out counted.
+    pub entry: usize,
     /// Path of the picture in the pose file, without leading `images/` and extension.
     pub name: String,
     /// Path of the picture on disk.
@@ -205,6 +229,17 @@ impl Frame {
     }
 }
 
+/// An entry of a pose file that cannot be loaded.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LeftOut {
+    /// Index of the entry, as [`Frame::entry`].
+    pub entry: usize,
+    /// Path of the picture in the pose file.
+    pub name: String,
+    /// What is wrong.
+    pub reason: String,
+}
+
 /// A set of posed photographs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
@@ -225,12 +260,26 @@ pub struct Scene {
     pub origin: DVec3,
     /// Warnings for the user, one line each.
     pub warnings: Vec<String>,
+    /// Entries of the pose file that cannot be loaded. They have no frame, but for those of another shape than
+    /// their picture's ([`Frame::other_shape`]).
+    pub left_out: Vec<LeftOut>,
 }
 
 impl Scene {
     /// Indices of the frames that can be loaded, as far as the headers of their pictures say.
     pub fn usable(&self) -> Vec<usize> {
         (0..self.frames.len()).filter(|&i| self.frames[i].other_shape.is_none()).collect()
+    }
+
+    /// Number of entries of the pose file, those that are left out counted.
+    pub fn entries(&self) -> usize {
+        let frames = self.frames.iter().map(|frame| frame.entry);
+        frames.chain(self.left_out.iter().map(|left| left.entry)).max().map_or(0, |last| last + 1)
+    }
+
+    /// Index of the frame of an entry ([`Frame::entry`]); `None` for one that is left out.
+    pub fn frame_of_entry(&self, entry: usize) -> Option<usize> {
+        self.frames.iter().position(|frame| frame.entry == entry)
     }
 
     /// Makes a scene of two photographs and their cameras. The cameras refer to the
@@ -261,7 +310,8 @@ impl Scene {
     ) -> Result<Self> {
         let names = distinct_names(photographs.iter().map(|(path, _)| path.as_path()));
         let drafts = photographs.iter().zip(names).map(|(photo, name)| upright_draft(photo, &name));
-        assemble(path.as_ref(), source, Pictures::Needed, drafts.collect())
+        let reading = Reading::new(Pictures::Needed);
+        assemble(path.as_ref(), source, &reading, drafts.collect())
     }
 
     /// [`Scene::from_photographs`] of photographs and of views of them.
@@ -282,7 +332,7 @@ impl Scene {
             Draft { view: view.cut.map(|cut| DraftView { cut, label }), ..draft }
         };
         let drafts = views.iter().map(draft).collect();
-        assemble(path, source, Pictures::Needed, drafts)
+        assemble(path, source, &Reading::new(Pictures::Needed), drafts)
     }
 }
 
@@ -347,7 +397,26 @@ fn upright_draft((path, camera): &(PathBuf, Camera), name: &Path) -> Draft {
 /// No pose file; a malformed pose file (the error names file and line or byte); no picture;
 /// a picture whose size does not match its camera.
 pub fn load_scene(path: impl AsRef<Path>) -> Result<Scene> {
-    load_at(path.as_ref(), Pictures::Needed)
+    load_at(path.as_ref(), Pictures::Needed, &SceneOptions::default())
+}
+
+/// Reads a scene as [`load_scene`] does, with options.
+///
+/// ```no_run
+/// use subsplat::files::poses::reading::SceneOptions;
+/// use subsplat::files::poses::scene::load_scene_with;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let options = SceneOptions { model: Some("sparse/1".into()), strict: true, ..Default::default() };
+/// let scene = load_scene_with("garden", &options)?;
+/// # Ok(())
+/// # }
+/// ```
+///
+/// # Errors
+/// Errors of [`load_scene`]; with [`SceneOptions::strict`] an entry that [`load_scene`] leaves out.
+pub fn load_scene_with(path: impl AsRef<Path>, options: &SceneOptions) -> Result<Scene> {
+    load_at(path.as_ref(), Pictures::Needed, options)
 }
 
 /// Reads the cameras of a folder or of a pose file as [`load_scene`] does. Their pictures need not exist:
@@ -356,31 +425,70 @@ pub fn load_scene(path: impl AsRef<Path>) -> Result<Scene> {
 /// # Errors
 /// No pose file; a malformed pose file; no camera with the size of its picture.
 pub fn load_cameras(path: impl AsRef<Path>) -> Result<Scene> {
-    load_at(path.as_ref(), Pictures::Unread)
+    load_at(path.as_ref(), Pictures::Unread, &SceneOptions::default())
 }
 
-fn load_at(path: &Path, pictures: Pictures) -> Result<Scene> {
+/// Reads cameras as [`load_cameras`] does, with options.
+///
+/// # Errors
+/// Errors of [`load_cameras`]; with [`SceneOptions::strict`] an entry that [`load_cameras`] leaves out.
+pub fn load_cameras_with(path: impl AsRef<Path>, options: &SceneOptions) -> Result<Scene> {
+    load_at(path.as_ref(), Pictures::Unread, options)
+}
+
+fn load_at(path: &Path, pictures: Pictures, options: &SceneOptions) -> Result<Scene> {
     let metadata = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+    if let Some(images) = options.images.as_deref().filter(|images| !images.is_dir()) {
+        return Err(Error::format(images, "a folder of pictures", "no folder"));
+    }
+    let folder = if metadata.is_dir() { path } else { path.parent().unwrap_or(Path::new("")) };
+    let reading = Reading::with(pictures, options, options.model.as_ref().map(|_| folder));
+    if let Some(model) = &options.model {
+        let inside = folder.join(model);
+        let model = if inside.exists() { inside } else { model.clone() };
+        return load_model(&model, &reading);
+    }
     if metadata.is_file() {
-        return load_file(path, pictures);
+        return load_file(path, &reading);
     }
     let Some(Found { file, notes }) = find(path)? else {
         let got = not_read(path).unwrap_or_else(|| "a folder with none of them".to_owned());
-        return Err(Error::format(
-            path,
-            "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, or \
-             poses.txt with K.txt",
-            got,
-        ));
+        return Err(Error::format(path, SCENES, got));
     };
-    let mut scene = match &file {
-        PoseFile::Json(file) => load_file(file, pictures),
-        PoseFile::Colmap(folder) => colmap::load(folder, pictures),
-        PoseFile::Re10k(file) => re10k::load(file),
-        PoseFile::Matrices(folder) => matrices::load(folder, matrices::PoseConvention::default()),
-    }?;
+    let mut scene = load_found(&file, &reading)?;
     scene.warnings.extend(notes);
     Ok(scene)
+}
+
+/// For messages: the pose files of a folder.
+pub(super) const SCENES: &str = "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, poses.txt with K.txt, or \
+     the cameras of OpenSfM, Polycam, Record3D, Bundler or LLFF";
+
+/// Reads the pose file or the folder of one that [`SceneOptions::model`] names.
+fn load_model(model: &Path, reading: &Reading<'_>) -> Result<Scene> {
+    let metadata = std::fs::metadata(model).map_err(|e| Error::io(model, e))?;
+    if metadata.is_file() {
+        return load_file(model, reading);
+    }
+    match find_in(model)? {
+        Some(Found { file, .. }) => load_found(&file, reading),
+        None => Err(Error::format(model, SCENES, "a folder with none of them")),
+    }
+}
+
+fn load_found(file: &PoseFile, reading: &Reading<'_>) -> Result<Scene> {
+    match file {
+        PoseFile::Json(file) => load_json(file, reading),
+        PoseFile::Colmap(folder) => colmap::load(folder, reading),
+        PoseFile::Re10k(file) => re10k::load(file, reading),
+        PoseFile::Matrices(folder) => matrices::load_with(folder, reading),
+        PoseFile::OpenSfm(file) => opensfm::load(file, reading),
+        PoseFile::Polycam(folder) => polycam::load(folder, reading),
+        PoseFile::Record3d(file) => record3d::load(file, reading),
+        PoseFile::Bundler(file) => bundler::load(file, reading),
+        PoseFile::Llff(file) => llff::load(file, reading),
+        PoseFile::Nerfstudio(file) => nerfstudio::load(file, reading),
+    }
 }
 
 /// Reports whether `path` is a folder with a pose file that [`load_scene`] reads.
@@ -394,22 +502,34 @@ pub fn has_scene(path: impl AsRef<Path>) -> bool {
     find(path.as_ref()).is_ok_and(|found| found.is_some())
 }
 
-fn load_file(path: &Path, pictures: Pictures) -> Result<Scene> {
+fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     let folder = path.parent().unwrap_or(Path::new(""));
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match (name.as_str(), extension.as_str()) {
-        (_, "json") if cameras_json::is_cameras_json(path)? => cameras_json::load(path, pictures),
-        (_, "json") => transforms::load(path, pictures),
+        (_, "json") | ("metadata", "") => match find::foreign_json(path) {
+            Some(file) => load_found(&file, reading),
+            None => load_json(path, reading),
+        },
+        (_, "npy") => llff::load(path, reading),
+        (_, "out") => bundler::load(path, reading),
         ("cameras.txt" | "images.txt" | "points3d.txt", _) | (_, "bin") => {
-            colmap::load(folder, pictures)
+            colmap::load(folder, reading)
         }
-        ("poses.txt" | "k.txt", _) => matrices::load(folder, matrices::PoseConvention::default()),
-        (_, "txt") => re10k::load(path),
+        ("poses.txt" | "k.txt", _) => matrices::load_with(folder, reading),
+        (_, "txt") => re10k::load(path, reading),
         _ => Err(Error::format(
             path,
-            "a folder or a pose file (.json, .txt, .bin)",
+            "a folder or a pose file (.json, .txt, .bin, .npy, .out)",
             format!("a file with extension `{extension}`"),
         )),
     }
+}
+
+/// Reads `cameras.json`, `transforms.json`, or a file of one of their layouts.
+fn load_json(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
+    if cameras_json::is_cameras_json(path)? {
+        return cameras_json::load(path, reading);
+    }
+    transforms::load(path, reading)
 }

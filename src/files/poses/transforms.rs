@@ -1,16 +1,18 @@
 //! `transforms.json` of nerfstudio and instant-ngp.
 //!
 //! Poses are OpenGL camera-to-world (x right, y up, −z forward); the reader negates the
-//! second and third column. Intrinsics are in pixels, per file or per frame: `fl_x`, `fl_y`
+//! second and third column, unless [`SceneOptions::convention`](super::reading::SceneOptions) says otherwise. Intrinsics are in pixels, per file or per frame: `fl_x`, `fl_y`
 //! (else `fl_x`), `cx`, `cy` (else the middle), `w`, `h` (else the stored picture's). Files
 //! without `fl_x` have `camera_angle_x` and `camera_angle_y` in radians. Camera models: none
 //! given, SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
 //! OPENCV_FISHEYE, EQUIRECTANGULAR (a picture becomes several frames, `super::panoramas`). `mask_path` of a frame names its mask ([`super::scene::Frame::mask`]). Other keys
 //! (`aabb_scale`, `sharpness`, `ply_file_path`, …) are ignored.
 
-use super::assemble::{Draft, Lens, Pictures, assemble, find_image};
+use super::assemble::{Draft, Lens, assemble, find_image};
 use super::cameras_json::{matrix, side};
 use super::json;
+use super::matrices::PoseConvention;
+use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
 use crate::files::photos::undistort::Distortion;
 use crate::files::photos::views::panorama_intrinsics;
@@ -116,18 +118,24 @@ pub(super) fn opengl_to_opencv(pose: DMat4) -> DMat4 {
 }
 
 /// Reads a scene. Frames without a picture are left out with a warning.
-pub(super) fn load(path: &Path, pictures: Pictures) -> Result<Scene> {
+pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let expected = "transforms.json (frames with file_path, transform_matrix)";
     let file: File = json::parse(path, &read(path)?, expected)?;
     let drafts = file.frames.into_iter().enumerate().map(|(i, frame)| {
         let name = frame.file_path.clone();
         let place = format!(" frame {i}");
-        draft(path, place, frame, &file.optics).unwrap_or_else(|e| Draft::refused(name, e))
+        draft(path, place, frame, &file.optics, reading).unwrap_or_else(|e| Draft::refused(name, e))
     });
-    assemble(path, SceneFormat::Transforms, pictures, drafts.collect())
+    assemble(path, SceneFormat::Transforms, reading, drafts.collect())
 }
 
-fn draft(path: &Path, place: String, frame: FileFrame, file: &Optics) -> Result<Draft> {
+fn draft(
+    path: &Path,
+    place: String,
+    frame: FileFrame,
+    file: &Optics,
+    reading: &Reading<'_>,
+) -> Result<Draft> {
     let bad = |expected: &str, got: String| Error::format(path, expected, got).at(&place);
     let pose = matrix(&frame.transform_matrix)
         .map_err(|got| bad("transform_matrix of 4x4 numbers", got))?;
@@ -147,7 +155,7 @@ fn draft(path: &Path, place: String, frame: FileFrame, file: &Optics) -> Result<
         _ => None,
     };
     let folder = path.parent().unwrap_or(Path::new(""));
-    let image = find_image(&[folder], &frame.file_path);
+    let image = reading.find(&[folder], &frame.file_path);
     let mask = frame.mask_path.filter(|mask| !mask.is_empty());
     // A name alone would be found among the photographs.
     let found =
@@ -165,7 +173,7 @@ fn draft(path: &Path, place: String, frame: FileFrame, file: &Optics) -> Result<
     let lens = lens(&optics, &distortion, stored).map_err(|got| {
         bad("fl_x, or camera_angle_x between 0 and π (for the file or the frame)", got)
     })?;
-    let pose = opengl_to_opencv(pose);
+    let pose = reading.pose(pose, PoseConvention::WorldFromCameraOpenGl);
     Ok(Draft {
         image,
         size: stored,

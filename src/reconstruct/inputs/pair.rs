@@ -381,6 +381,7 @@ mod tests {
 
     fn scene(cameras: Vec<Camera>) -> Scene {
         let frame = |camera| Frame {
+            entry: 0,
             other_shape: None,
             name: String::new(),
             image: "".into(),
@@ -402,6 +403,7 @@ mod tests {
             near_far: None,
             origin: Default::default(),
             warnings: Vec::new(),
+            left_out: Vec::new(),
         }
     }
 

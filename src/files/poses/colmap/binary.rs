@@ -178,10 +178,10 @@ fn images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
     Ok(images)
 }
 
-/// Reads `points3D.bin`; `path` is for messages.
+/// Reads `points3D.bin`; `path` is for messages. A position may be no finite number.
 ///
 /// # Errors
-/// Truncated, a position that is not finite.
+/// Truncated.
 pub fn parse_points(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Points> {
     points(path.as_ref(), bytes)
 }
@@ -191,14 +191,8 @@ fn points(path: &Path, bytes: &[u8]) -> Result<Points> {
     let n = c.count(51, "points")?;
     let mut points = Points::with_capacity(n);
     for _ in 0..n {
-        let start = c.at;
         let id = c.u64("a point id")?;
-        let position = c.f64s::<3>("a position")?;
-        let p = DVec3::from_array(position);
-        if !p.is_finite() {
-            let at = format!(" at byte {start}");
-            return Err(c.error("a finite position", format!("{position:?}")).at(at));
-        }
+        let p = DVec3::from_array(c.f64s::<3>("a position")?);
         c.take(3, "a colour")?;
         c.f64("an error")?;
         let track = c.count(8, "track entries")?;

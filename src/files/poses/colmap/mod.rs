@@ -15,7 +15,8 @@ mod binary;
 mod text;
 mod write;
 
-use super::assemble::{Draft, Lens, Pictures, assemble, find_image};
+use super::assemble::{Draft, Lens, assemble};
+use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
 use crate::files::photos::undistort::Distortion;
 use crate::files::photos::views::panorama_intrinsics;
@@ -214,7 +215,7 @@ fn pose(q: [f64; 4], t: [f64; 3]) -> std::result::Result<(DQuat, DVec3), String>
 
 /// Reads the model in `folder`. Pictures may lie beside it, in its parents, and in an
 /// `images` folder of any of them.
-pub(super) fn load(folder: &Path, pictures: Pictures) -> Result<Scene> {
+pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let binary = folder.join("cameras.bin").is_file() && folder.join("images.bin").is_file();
     let extension = if binary { "bin" } else { "txt" };
     let path = |stem: &str| folder.join(format!("{stem}.{extension}"));
@@ -234,7 +235,7 @@ pub(super) fn load(folder: &Path, pictures: Pictures) -> Result<Scene> {
     } else {
         parse_images_txt(&images_path, &bytes, &mut warnings)?
     };
-    let points = if points_path.is_file() {
+    let mut points = if points_path.is_file() {
         let bytes = read(&points_path)?;
         if binary {
             parse_points_bin(&points_path, &bytes)?
@@ -246,6 +247,19 @@ pub(super) fn load(folder: &Path, pictures: Pictures) -> Result<Scene> {
         Points::new()
     };
     images.sort_by(|a, b| a.name.cmp(&b.name));
+    let (count, first) = (points.len(), points.iter().find(|(_, p)| !p.is_finite()).copied());
+    points.retain(|(_, position)| position.is_finite());
+    if let Some((id, position)) = first {
+        let bad = count - points.len();
+        let got = format!("{bad} of {count} that are not: point {id} at {position}");
+        if reading.strict {
+            return Err(Error::format(&points_path, "points with finite positions (strict)", got));
+        }
+        warnings.push(format!(
+            "{}: {bad} of {count} points have no finite position and are left out (point {id})",
+            points_path.display()
+        ));
+    }
 
     let index: HashMap<u64, u32> =
         points.iter().enumerate().map(|(i, (id, _))| (*id, i as u32)).collect();
@@ -253,9 +267,9 @@ pub(super) fn load(folder: &Path, pictures: Pictures) -> Result<Scene> {
     let roots: Vec<&Path> = roots.iter().map(PathBuf::as_path).collect();
     let drafts = images
         .into_iter()
-        .map(|image| draft(&images_path, image, &cameras, &index, &roots))
+        .map(|image| draft(&images_path, image, &cameras, &index, &roots, reading))
         .collect::<Result<Vec<_>>>()?;
-    let mut scene = assemble(&images_path, SceneFormat::Colmap, pictures, drafts)?;
+    let mut scene = assemble(&images_path, SceneFormat::Colmap, reading, drafts)?;
     let origin = scene.origin;
     let place = |(_, p): (u64, DVec3)| (p - origin).as_vec3();
     scene.points = (!points.is_empty()).then(|| points.into_iter().map(place).collect());
@@ -270,6 +284,7 @@ fn draft(
     cameras: &Cameras,
     index: &HashMap<u64, u32>,
     roots: &[&Path],
+    reading: &Reading<'_>,
 ) -> Result<Draft> {
     let camera = match cameras.get(&image.camera) {
         Some(Ok(camera)) => camera,
@@ -291,7 +306,7 @@ fn draft(
     visible.sort_unstable();
     visible.dedup();
     Ok(Draft {
-        image: find_image(roots, &image.name),
+        image: reading.find(roots, &image.name),
         size: Some((camera.width, camera.height)),
         distortion: camera.distortion,
         visible,

@@ -202,10 +202,10 @@ fn image(line: Line<'_>) -> Result<ColmapImage> {
     Ok(ColmapImage { place, rotation, translation, refused, camera, name, points })
 }
 
-/// Reads `points3D.txt`; `path` is for messages.
+/// Reads `points3D.txt`; `path` is for messages. A position may be no finite number.
 ///
 /// # Errors
-/// A line that does not parse, a position that is not finite.
+/// A line that does not parse.
 pub fn parse_points(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Points> {
     points(path.as_ref(), bytes)
 }
@@ -215,11 +215,7 @@ fn points(path: &Path, bytes: &[u8]) -> Result<Points> {
     for line in records(path, bytes)? {
         let mut words = line.text.split_ascii_whitespace();
         let id = line.number(words.next(), "a point id")?;
-        let position = line.numbers::<3>(&mut words, "a position X Y Z")?;
-        let p = DVec3::from_array(position);
-        if !p.is_finite() {
-            return Err(line.error("a finite position", format!("{position:?}")));
-        }
+        let p = DVec3::from_array(line.numbers::<3>(&mut words, "a position X Y Z")?);
         points.push((id, p));
     }
     Ok(points)

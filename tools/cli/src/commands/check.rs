@@ -1,6 +1,7 @@
 //! `subsplat check`: checks poses by points matched between the photographs.
 
 use super::args::CheckArgs;
+use super::info::{left_out, print_left_out};
 use super::{frames, pair};
 use crate::report::{Answer, Progress, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, ensure};
@@ -34,7 +35,8 @@ pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
         for &[i, j] in &pairs {
             let (report, picture) = judge(&scene, i, j)?;
             good &= report.verdict != Verdict::Bad;
-            let file = args.out.join(format!("epipolar_{i}_{j}.png"));
+            let [a, b] = [i, j].map(|i| scene.frames[i].entry);
+            let file = args.out.join(format!("epipolar_{a}_{b}.png"));
             if let Some(picture) = &picture {
                 save_png(&file, picture)?;
             }
@@ -56,9 +58,11 @@ pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
         "scene": scene.name,
         "ok": good,
         "pairs": reports,
+        "left_out": left_out(&scene),
         "seconds": progress.seconds(),
         "peak_memory_bytes": peak_memory_bytes(),
     }))?;
+    print_left_out(&scene);
     Ok(good)
 }
 
@@ -125,8 +129,10 @@ fn verdict_name(verdict: Verdict) -> &'static str {
 fn print_report(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
     let names = [&scene.frames[i].name, &scene.frames[j].name];
     answer.line(format!(
-        "photographs {i} ({}) and {j} ({}): {}",
+        "photographs {} ({}) and {} ({}): {}",
+        scene.frames[i].entry,
         names[0],
+        scene.frames[j].entry,
         names[1],
         verdict_name(report.verdict)
     ));

@@ -6,6 +6,7 @@ use super::render;
 use crate::report::{Answer, Progress, print_warning};
 use anyhow::{Result, bail};
 use serde_json::json;
+use subsplat::files::poses::reading::SceneOptions;
 use subsplat::files::splats::ply::is_own_comment;
 use subsplat::files::{SaveOptions, save_splats};
 use subsplat::finish::reduce;
@@ -26,14 +27,19 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             args.out.display()
         );
     }
-    let (mut splats, mut comments) = progress.stage("scene", |_| render::load(&file))?;
+    let (mut splats, mut comments) = progress.stage("scene", |_| render::load(&file, false))?;
     comments.retain(|comment| !is_own_comment(comment));
     let stored = options_of_comments(&comments);
     let all = splats.len();
     // cameras.json of `run` holds the views, the comment the first photograph.
     let own = camera_of_comments(&comments);
     let beside = if html || args.gaussians.is_some() {
-        render::cameras_beside(args.cameras.as_deref(), &file, origin_of_comments(&comments))?
+        render::cameras_beside(
+            args.cameras.as_deref(),
+            &file,
+            origin_of_comments(&comments),
+            &SceneOptions::default(),
+        )?
     } else {
         None
     };

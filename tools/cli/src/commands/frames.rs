@@ -43,10 +43,29 @@ pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>
     wanted.iter().map(one).collect()
 }
 
-/// Finds frames of a scene by [`pick`].
+/// Finds frames of a scene by [`pick`]. Numbers are those of the pose file's entries, so that an entry that is
+/// left out does not shift the others.
 pub fn indices(scene: &Scene, wanted: &[String], flag: &str) -> Result<Vec<usize>> {
-    let names: Vec<&str> = scene.frames.iter().map(|f| f.name.as_str()).collect();
-    pick(&names, wanted, flag)
+    let mut names = vec![""; scene.entries()];
+    for left in &scene.left_out {
+        names[left.entry] = &left.name;
+    }
+    for frame in &scene.frames {
+        names[frame.entry] = &frame.name;
+    }
+    pick(&names, wanted, flag)?.into_iter().map(|entry| of_entry(scene, entry, flag)).collect()
+}
+
+/// The frame of an entry; `from` names the origin of the number in messages.
+fn of_entry(scene: &Scene, entry: usize, from: &str) -> Result<usize> {
+    scene.frame_of_entry(entry).with_context(|| {
+        let left = scene.left_out.iter().find(|left| left.entry == entry);
+        let why = left.map(|left| format!("{}, which is left out: {}", left.name, left.reason));
+        format!(
+            "{from}: expected a photograph that can be used, got {entry} ({})",
+            why.unwrap_or_default()
+        )
+    })
 }
 
 /// Distinct file stems for pictures of `names`.
@@ -70,9 +89,13 @@ pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
     if !scene.source.has_file() || !file.is_file() {
         return Ok(Vec::new());
     }
-    let tests = load_protocol(&file)?.tests;
-    for test in &tests {
-        test.check(&file, scene.frames.len())?;
+    let mut tests = load_protocol(&file)?.tests;
+    let name = file.display().to_string();
+    for test in &mut tests {
+        test.check(&file, scene.entries())?;
+        for entry in test.context.iter_mut().chain(&mut test.target) {
+            *entry = of_entry(scene, *entry, &name)?;
+        }
     }
     Ok(tests)
 }

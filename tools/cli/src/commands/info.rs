@@ -1,7 +1,7 @@
 //! `subsplat info`: describes a file or a scene.
 
 use super::args::InfoArgs;
-use crate::report::Answer;
+use crate::report::{Answer, print_line};
 use anyhow::{Context, Result, bail};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -150,7 +150,8 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
         scene.points.as_ref().map_or(0, Vec::len)
     ));
     scene.warnings.iter().for_each(|w| answer.line(format!("  warning: {w}")));
-    let frame = |(i, f): (usize, &subsplat::files::poses::scene::Frame)| {
+    let frame = |f: &subsplat::files::poses::scene::Frame| {
+        let i = f.entry;
         let k = f.camera.intrinsics();
         let p = f.camera.position();
         answer.line(format!(
@@ -168,6 +169,7 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
             p.z
         ));
         json!({
+            "entry": i,
             "name": f.name,
             "image": f.image.display().to_string(),
             "width": k.width,
@@ -176,7 +178,10 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
             "world_from_camera": f.camera.world_from_camera().transpose().to_cols_array_2d(),
         })
     };
-    let frames: Vec<Value> = scene.frames.iter().enumerate().map(frame).collect();
+    let frames: Vec<Value> = scene.frames.iter().map(frame).collect();
+    for left in &scene.left_out {
+        answer.line(format!("  {:>3} {:<12} left out: {}", left.entry, left.name, left.reason));
+    }
     Ok(json!({
         "kind": "scene",
         "file": path.display().to_string(),
@@ -186,5 +191,30 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
         "near_far": scene.near_far.map(|range| [range.near, range.far]),
         "sparse_points": scene.points.as_ref().map_or(0, Vec::len),
         "warnings": scene.warnings,
+        "left_out": left_out(&scene),
     }))
+}
+
+/// Most entries that [`print_left_out`] names.
+const LEFT_OUT_MAX: usize = 20;
+
+/// Prints the entries of a pose file that were left out, with their reasons.
+pub fn print_left_out(scene: &Scene) {
+    let left = &scene.left_out;
+    if left.is_empty() {
+        return;
+    }
+    print_line(format!("left out of {} entries of the pose file: {}", scene.entries(), left.len()));
+    for one in left.iter().take(LEFT_OUT_MAX) {
+        print_line(format!("  {:>3} {}: {}", one.entry, one.name, one.reason));
+    }
+    if left.len() > LEFT_OUT_MAX {
+        print_line(format!("  and {} more", left.len() - LEFT_OUT_MAX));
+    }
+}
+
+/// Entries of a pose file that are left out, for `--json`.
+pub fn left_out(scene: &Scene) -> Vec<Value> {
+    let left = scene.left_out.iter();
+    left.map(|l| json!({ "entry": l.entry, "name": l.name, "reason": l.reason })).collect()
 }

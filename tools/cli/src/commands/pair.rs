@@ -1,6 +1,6 @@
 //! The scene of the command line: a scene's path, or photographs with given or estimated cameras.
 
-use super::args::{PairArgs, PoseConventionArg};
+use super::args::{PairArgs, PoseConventionArg, ReadArgs};
 use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
@@ -11,12 +11,15 @@ use subsplat::files::photos::folder::{FolderPhotographs, find_photographs};
 use subsplat::files::photos::image::{LoadOptions, Truncated, probe};
 use subsplat::files::photos::photograph::{PhotographHeader, probe_photograph};
 use subsplat::files::poses::find::{folders, is_own_output, not_read};
-use subsplat::files::poses::matrices;
 use subsplat::files::poses::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
-use subsplat::files::poses::scene::{Scene, SceneFormat, has_scene, load_scene};
+use subsplat::files::poses::scene::{Scene, SceneFormat, has_scene, load_scene_with};
 use subsplat::reconstruct::{KnownLens, Projection};
 use subsplat::{EstimateOptions, EstimatedScene, estimate_cameras_of_files};
 use subsplat_kernels::camera::{Camera, Intrinsics};
+
+/// Formats whose matrices programs write in several conventions.
+const WITH_CONVENTION: [SceneFormat; 3] =
+    [SceneFormat::Matrices, SceneFormat::Transforms, SceneFormat::Polycam];
 
 /// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones.
 pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Scene> {
@@ -24,7 +27,7 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
         ensure!(args.lens.is_none(), "--lens: only without --move and --pose-b");
         return of_photographs(a, b, args);
     }
-    if let Some(photographs) = photographs(input)? {
+    if let Some(photographs) = photographs(input, &args.read)? {
         if let Some(flag) = args.first_pose_flag() {
             bail!("{flag}: expected two photographs with --move or --pose-b, got neither flag");
         }
@@ -47,23 +50,25 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
             one.display()
         );
     }
-    let scene = load_scene(one)?;
-    let Some(convention) = args.pose_convention else { return Ok(scene) };
+    let convention = args.pose_convention.map(PoseConvention::from);
+    let scene = load_scene_with(one, &args.read.options(convention))?;
     ensure!(
-        scene.source == SceneFormat::Matrices,
-        "--pose-convention: expected two photographs or a scene with poses.txt, got {} ({})",
+        convention.is_none() || WITH_CONVENTION.contains(&scene.source),
+        "--pose-convention: expected two photographs, or a scene with poses.txt, transforms.json or \
+         Polycam's cameras, got {} ({})",
         one.display(),
         scene.source.name()
     );
-    Ok(matrices::load(folder_of(one), convention.into())?)
+    Ok(scene)
 }
 
 /// The photographs that `input` names: two or more files and folders, or a folder without cameras. `None`
 /// for a scene.
 ///
 /// # Errors
-/// One photograph; a file among several that is no picture; pictures that `subsplat run` rendered.
-pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
+/// One photograph; a file among several that is no picture; pictures that `subsplat run` rendered; with
+/// `--strict` a picture that cannot be read.
+pub fn photographs(input: &[PathBuf], read: &ReadArgs) -> Result<Option<Vec<PathBuf>>> {
     if let Some(folder) = input.iter().find(|path| is_own_output(path)) {
         bail!(
             "{}: expected photographs, got pictures that subsplat rendered; give the photographs, or open \
@@ -72,9 +77,24 @@ pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
             folder.join("scene.ply").display()
         );
     }
+    if let [_] = input
+        && read.model_path.is_some()
+    {
+        return Ok(None);
+    }
+    let flag = [(read.model_path.is_some(), "--model"), (read.images.is_some(), "--images")];
+    let flag = flag.into_iter().find(|f| f.0).map(|f| f.1);
+    let no_scene = |input: &Path| match flag {
+        Some(flag) => bail!(
+            "{flag}: expected one scene with cameras, got photographs alone ({}); leave the flag out",
+            input.display()
+        ),
+        None => Ok(()),
+    };
     if let [one] = input {
         if one.is_dir() && !has_scene(one) {
-            return of_folder(one).map(Some);
+            no_scene(one)?;
+            return of_folder(one, read.strict).map(Some);
         }
         let is_picture = one.is_file() && probe(one).is_ok();
         ensure!(
@@ -84,14 +104,12 @@ pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
         );
         return Ok(None);
     }
+    no_scene(&input[0])?;
     let mut all = Vec::with_capacity(input.len());
     for path in input {
         if path.is_dir() {
             let found = find_photographs(path);
-            found
-                .notes()
-                .iter()
-                .for_each(|note| print_warning(format!("{}: {note}", path.display())));
+            say_left_out(path, &found, read.strict)?;
             ensure!(
                 !found.photographs.is_empty(),
                 "{}: expected photographs, got none",
@@ -106,8 +124,22 @@ pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
     Ok(Some(all))
 }
 
+/// Prints what is left out of a folder's photographs; an error where `strict`.
+fn say_left_out(folder: &Path, found: &FolderPhotographs, strict: bool) -> Result<()> {
+    if let (true, [[name, reason], ..]) = (strict, found.left_out.as_slice()) {
+        bail!(
+            "{}: expected pictures that can be read (--strict), got {} that cannot: the first is {name} \
+             ({reason})",
+            folder.display(),
+            found.left_out.len()
+        );
+    }
+    found.notes().iter().for_each(|note| print_warning(format!("{}: {note}", folder.display())));
+    Ok(())
+}
+
 /// The photographs of a folder without cameras, or of the one folder below it that has some.
-fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
+fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
     let mut found = find_photographs(folder);
     let mut name = folder.to_owned();
     let mut below: Vec<(PathBuf, FolderPhotographs)> = Vec::new();
@@ -121,7 +153,7 @@ fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
             print_line(format!("the photographs are those of {}", name.display()));
         }
     }
-    found.notes().iter().for_each(|note| print_warning(format!("{}: {note}", name.display())));
+    say_left_out(&name, &found, strict)?;
     if let Some(cameras) = not_read(folder) {
         print_warning(cameras);
     }
@@ -140,8 +172,8 @@ fn of_folder(folder: &Path) -> Result<Vec<PathBuf>> {
     );
     ensure!(
         found.photographs.len() >= 2,
-        "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a RealEstate10K txt, or \
-         poses.txt with K.txt) or a folder of at least 2 photographs, got {} photograph(s) and no cameras",
+        "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a RealEstate10K txt, poses.txt \
+         with K.txt, or cameras of OpenSfM, Polycam, Record3D, Bundler or LLFF) or a folder of at least 2 photographs, got {} photograph(s) and no cameras",
         folder.display(),
         found.photographs.len()
     );

@@ -1,6 +1,6 @@
 //! `subsplat poses`: cameras of photographs that come without any.
 
-use super::args::PosesArgs;
+use super::args::{PosesArgs, ReadArgs};
 use super::pair::{self, EstimateRequest};
 use crate::report::{Answer, Progress, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result, ensure};
@@ -18,7 +18,8 @@ use subsplat_kernels::camera::Camera;
 /// Runs the command.
 pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
-    let photographs = pair::photographs(&args.input)?.with_context(|| {
+    let read = ReadArgs { strict: args.strict, ..Default::default() };
+    let photographs = pair::photographs(&args.input, &read)?.with_context(|| {
         format!("{}: expected photographs, got a scene with cameras", args.input[0].display())
     })?;
     check_names(&photographs)?;

@@ -15,7 +15,8 @@ use subsplat::files::load_splat_file;
 use subsplat::files::photos::image::{probe, save_depth_png, save_png};
 use subsplat::files::photos::photograph::list_photographs;
 use subsplat::files::poses::cameras_json::is_cameras_json;
-use subsplat::files::poses::scene::{is_scene, load_cameras, load_scene};
+use subsplat::files::poses::reading::SceneOptions;
+use subsplat::files::poses::scene::{is_scene, load_cameras_with, load_scene_with};
 use subsplat::scene::pictures::{Depth, Rgb};
 use subsplat::scene::render::{
     Renderer, camera_of_comments, options_of_comments, origin_of_comments,
@@ -37,7 +38,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     args.size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
     args.motion.video.as_deref().map_or(Ok(()), video::check)?;
     let file = scene_file(&args.scene)?;
-    let (splats, comments) = progress.stage("scene", |_| load(&file))?;
+    let (splats, comments) = progress.stage("scene", |_| load(&file, args.strict))?;
     let cameras = cameras(args, &file, &splats, &comments)?;
     check_sizes(&cameras)?;
     let options = options(&args.rendering, args.near, args.sh_degree, &splats, &comments)?;
@@ -103,8 +104,14 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
 }
 
 /// Splats and comments of a scene file. Prints as warnings what was left out, applied or not read.
-pub fn load(file: &Path) -> Result<(Splats, Vec<String>)> {
+///
+/// # Errors
+/// Errors of the reader; with `strict` splats that are left out.
+pub fn load(file: &Path, strict: bool) -> Result<(Splats, Vec<String>)> {
     let content = load_splat_file(file)?;
+    if let (true, Some(left)) = (strict, content.notes.iter().find(|n| n.starts_with("left out"))) {
+        bail!("{}: expected splats that can all be drawn (--strict), got {left}", file.display());
+    }
     content.notes.iter().for_each(print_warning);
     Ok((content.splats, content.comments))
 }
@@ -233,7 +240,9 @@ fn named_cameras(
     comments: &[String],
 ) -> Result<Vec<(String, Camera)>> {
     let origin = origin_of_comments(comments);
-    let Some(all) = cameras_beside(args.cameras.as_deref(), file, origin)? else {
+    let options =
+        SceneOptions { model: args.model.clone(), strict: args.strict, ..SceneOptions::default() };
+    let Some(all) = cameras_beside(args.cameras.as_deref(), file, origin, &options)? else {
         ensure!(
             args.target.is_empty(),
             "--target: expected --cameras, or cameras.json beside the scene, got neither"
@@ -270,6 +279,7 @@ pub fn cameras_beside(
     given: Option<&Path>,
     file: &Path,
     origin: DVec3,
+    options: &SceneOptions,
 ) -> Result<Option<Vec<(String, Camera)>>> {
     let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
     let source = match given {
@@ -277,21 +287,25 @@ pub fn cameras_beside(
         None if beside.is_file() => &beside,
         None => return Ok(None),
     };
-    let all = read_cameras(source, origin)?;
+    let all = read_cameras(source, origin, options)?;
     ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
     Ok(Some(all))
 }
 
 /// Names and cameras of a pose file or scene folder, whose pictures need not exist. They are moved to the
 /// world whose origin is `origin`, that of the splats.
-pub fn read_cameras(source: &Path, origin: DVec3) -> Result<Vec<(String, Camera)>> {
+pub fn read_cameras(
+    source: &Path,
+    origin: DVec3,
+    options: &SceneOptions,
+) -> Result<Vec<(String, Camera)>> {
     let inside = source.join("cameras.json");
     let list = if inside.is_file() { &inside } else { source };
     // A camera list needs no pictures; another pose file may have pictures of another size.
-    let scene = if list.is_file() && is_cameras_json(list)? {
-        load_cameras(list)?
+    let scene = if options.model.is_none() && list.is_file() && is_cameras_json(list)? {
+        load_cameras_with(list, options)?
     } else {
-        load_scene(source).or_else(|_| load_cameras(source))?
+        load_scene_with(source, options).or_else(|_| load_cameras_with(source, options))?
     };
     scene.warnings.iter().for_each(print_warning);
     let by = (scene.origin - origin).as_vec3();

@@ -5,6 +5,7 @@ use super::args::{
 };
 use super::frames::{self, DepthSpread};
 use super::html::Page;
+use super::info::print_left_out;
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
 use super::{browser, memory, model, pair, render, video};
@@ -123,7 +124,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let video = video::finish(job.video.take(), &args.motion, answer)?;
     let assessment = progress.stage("inputs", |_| result.assess(&mut renderer, &options))?;
     Done { model, result, options, scored, assessment, files, video }
-        .finish(args, &plan, progress, answer)
+        .finish(args, &plan, progress, answer)?;
+    print_left_out(&plan.scene);
+    Ok(())
 }
 
 /// Crop of the targets' photographs: that of the inputs, which all have one size.
@@ -198,7 +201,8 @@ pub fn photographs(
 /// the reason for the choice too.
 pub fn context(args: &SourceArgs, input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
     let (named, most) = (&args.context, args.photographs_max());
-    let list = |frames: &[usize]| frames.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
+    let entry = |&i: &usize| scene.frames[i].entry.to_string();
+    let list = |frames: &[usize]| frames.iter().map(entry).collect::<Vec<_>>().join(",");
     if !named.is_empty() {
         let chosen = frames::indices(scene, named, "--context")?;
         ensure!(

@@ -86,6 +86,7 @@ fn broken_files() {
     let cut = copy("cut").join("images/view2.png");
     let bytes = std::fs::read(&cut).unwrap();
     std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    std::fs::write(at("cut/images/broken.png"), "").unwrap();
     std::fs::remove_file(copy("poseless").join("cameras.json")).unwrap();
     let listed = std::fs::read_to_string(at("scene/cameras.json")).unwrap();
     let edit = |name: &str, from: &str, to: &str| {
@@ -98,13 +99,22 @@ fn broken_files() {
     edit("unclosed", "}", "");
     std::fs::write(at("scene.ply"), "ply\nformat binary_little_endian 1.0\n").unwrap();
     std::fs::write(at("empty.spz"), "").unwrap();
-    let rows: [Row; 10] = [
+    let rows: [Row; 16] = [
         ("run cut --context 0,2", "view2.png"),
         ("check cut --context 0,2", "view2.png"),
         ("info poseless", "cameras.json"),
         ("run sizes --context 0,2", "128x128"),
-        // The first frame is left out, so there are two.
-        ("run nan --context 0,2", "--context: expected a number below 2"),
+        // Numbers are those of the file's entries, of which the first is left out.
+        (
+            "run nan --context 0,2",
+            "got 0 (images/view0.png, which is left out: cameras.json frame 0",
+        ),
+        ("run nan --context 1,3", "--context: expected a number below 3"),
+        ("check nan --strict", "got 1 that are not used: the first is images/view0.png"),
+        ("check scene --model nowhere.json", "nowhere.json"),
+        ("check scene --images nowhere", "nowhere: expected a folder of pictures"),
+        ("check scene/images --images scene", "--images: expected one scene with cameras"),
+        ("poses cut/images --strict", "got 1 that cannot: the first is broken.png (an empty file)"),
         ("info unclosed", "cameras.json:"),
         ("render scene.ply", "scene.ply"),
         ("info scene.ply", "scene.ply"),

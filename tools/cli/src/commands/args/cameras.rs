@@ -3,7 +3,41 @@
 use super::groups::CAMERAS;
 use crate::commands::values;
 use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+use subsplat::files::poses::matrices::PoseConvention;
+use subsplat::files::poses::reading::SceneOptions;
 use subsplat::reconstruct::Projection;
+
+/// What to read of a scene with cameras.
+#[derive(Clone, Debug, Default, Args)]
+pub struct ReadArgs {
+    /// Cameras to read, where a scene has several: a pose file, or the folder of a COLMAP model.
+    ///
+    /// The path is one below the scene's folder, such as sparse/1 or transforms_test.json, or any other.
+    /// Default: of several models the largest; a line names the others.
+    #[arg(long = "model", value_name = "PATH", hide_short_help = true, help_heading = CAMERAS)]
+    pub model_path: Option<PathBuf>,
+    /// Folder of the scene's pictures.
+    ///
+    /// Default: the folders in which the program that wrote the cameras has them, such as images beside
+    /// transforms.json.
+    #[arg(long = "images", value_name = "DIR", hide_short_help = true, help_heading = CAMERAS)]
+    pub images: Option<PathBuf>,
+    /// Refuse what would be left out: broken cameras, pictures that cannot be read, unused masks.
+    ///
+    /// The error names the first, and their number. Default: what is not needed is left out, and a line
+    /// names it.
+    #[arg(long, hide_short_help = true, help_heading = CAMERAS)]
+    pub strict: bool,
+}
+
+impl ReadArgs {
+    /// Options of the scene's loader.
+    pub fn options(&self, convention: Option<PoseConvention>) -> SceneOptions {
+        let Self { model_path, images, strict } = self.clone();
+        SceneOptions { model: model_path, images, strict, convention }
+    }
+}
 
 /// Cameras of photographs that come without a pose file.
 ///
@@ -76,11 +110,15 @@ pub struct PairArgs {
         help_heading = CAMERAS
     )]
     pub pose_b: Option<String>,
-    /// Axes and direction of --pose-a and --pose-b, or of a scene's poses.txt.
+    /// Axes and direction of --pose-a and --pose-b, or of a scene's matrices.
     ///
-    /// Default: opencv-c2w.
+    /// A scene with poses.txt, transforms.json or Polycam's cameras: where a program wrote other axes than the
+    /// format's. Default: opengl-c2w for transforms.json and Polycam, else opencv-c2w.
     #[arg(long, value_enum, hide_short_help = true, help_heading = CAMERAS)]
     pub pose_convention: Option<PoseConventionArg>,
+    /// Cameras and pictures of a scene.
+    #[command(flatten)]
+    pub read: ReadArgs,
     /// Accept doubtful cameras and truncated JPEG files.
     #[arg(long, help_heading = CAMERAS)]
     pub force: bool,

@@ -17,7 +17,7 @@ mod source;
 #[cfg(feature = "view")]
 pub mod view;
 
-pub use cameras::{PairArgs, PoseConventionArg};
+pub use cameras::{PairArgs, PoseConventionArg, ReadArgs};
 pub use check::CheckArgs;
 pub use export::{ExportArgs, UpArg};
 pub use files::{ContentArgs, SceneFormatArg};

@@ -35,4 +35,9 @@ pub struct PosesArgs {
     /// Accept doubtful cameras and truncated JPEG files.
     #[arg(long)]
     pub force: bool,
+    /// Refuse pictures that cannot be read; the error names the first, and their number.
+    ///
+    /// Default: they are left out, and a line names them.
+    #[arg(long)]
+    pub strict: bool,
 }

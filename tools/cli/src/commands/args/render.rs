@@ -60,6 +60,14 @@ pub struct RenderArgs {
     /// the whole.
     #[arg(long, value_name = "SCENE", help_heading = CAMERAS)]
     pub cameras: Option<PathBuf>,
+    /// Cameras of --cameras to read, where that scene has several: a pose file, or the folder of a COLMAP model.
+    #[arg(long, value_name = "PATH", requires = "cameras", help_heading = CAMERAS)]
+    pub model: Option<PathBuf>,
+    /// Refuse what would be left out: splats that are no numbers, cameras that are broken.
+    ///
+    /// The error names the first, and their number.
+    #[arg(long, hide_short_help = true, help_heading = CAMERAS)]
+    pub strict: bool,
     /// Cameras to draw from, among those of --cameras: names or numbers from 0 (default: all).
     #[arg(long, value_delimiter = ',', value_name = "I,J,…", help_heading = CAMERAS)]
     pub target: Vec<String>,

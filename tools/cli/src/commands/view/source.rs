@@ -92,14 +92,16 @@ fn is_splats(path: &Path) -> Result<bool> {
 }
 
 fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Source> {
-    let (splats, comments) = progress.stage("scene", |_| render::load(path))?;
+    let (splats, comments) =
+        progress.stage("scene", |_| render::load(path, args.source.pair.read.strict))?;
     let options =
         render::options(&args.rendering(), args.source.near, SH_DEGREE, &splats, &comments)?;
     let beside = path.parent().unwrap_or(Path::new("")).join("cameras.json");
     let origin = origin_of_comments(&comments);
+    let read = args.source.pair.read.options(None);
     let cameras = match &args.cameras {
-        Some(source) => render::read_cameras(source, origin)?,
-        None if beside.is_file() => render::read_cameras(&beside, origin)?,
+        Some(source) => render::read_cameras(source, origin, &read)?,
+        None if beside.is_file() => render::read_cameras(&beside, origin, &read)?,
         None => {
             let own = camera_of_comments(&comments);
             vec![(String::new(), own.map_or_else(|| whole::camera(&splats, &comments), Ok)?)]

@@ -1,0 +1,73 @@
+//! Flags about what is read of a scene: --model, --images, --strict, --pose-convention.
+
+use crate::program;
+
+use program::{call_in, workplace};
+use serde_json::Value;
+
+#[test]
+fn models_pictures_and_axes_are_chosen() {
+    let place = workplace();
+    let at = |name: &str| place.path().join(name);
+    let text = std::fs::read_to_string(at("scene/cameras.json")).unwrap();
+    let all: Value = serde_json::from_str(&text).unwrap();
+    let mut two = all.clone();
+    two["frames"].as_array_mut().unwrap().remove(1);
+    std::fs::write(at("scene/two.json"), two.to_string()).unwrap();
+    let photographs = |arguments: &str| {
+        let called = call_in(place.path(), &format!("check scene -o out {arguments}"));
+        let line = called.stderr.lines().find(|l| l.contains(" photographs (")).map(str::to_owned);
+        line.unwrap_or(called.stderr)
+    };
+    assert!(photographs("").contains("scene: 3 photographs (cameras.json)"));
+    let chosen = photographs("--model two.json");
+    assert!(chosen.contains("scene: 2 photographs (cameras.json)"), "{chosen}");
+    // The pictures lie elsewhere.
+    std::fs::rename(at("scene/images"), at("elsewhere")).unwrap();
+    let chosen = photographs("--images elsewhere");
+    assert!(chosen.contains("3 photographs"), "{chosen}");
+    // OpenCV's matrices in a file of OpenGL's format.
+    let frame = |f: &Value| {
+        serde_json::json!({ "file_path": f["file"], "fl_x": f["fx"], "fl_y": f["fy"], "cx": f["cx"],
+            "cy": f["cy"], "w": f["width"], "h": f["height"], "transform_matrix": f["c2w"] })
+    };
+    let frames: Vec<Value> = all["frames"].as_array().unwrap().iter().map(frame).collect();
+    std::fs::create_dir(at("other")).unwrap();
+    std::fs::rename(at("elsewhere"), at("other/images")).unwrap();
+    let text = serde_json::json!({ "frames": frames }).to_string();
+    std::fs::write(at("other/transforms.json"), text).unwrap();
+    let reports = |arguments: &str| {
+        call_in(place.path(), &format!("--json check other -o out {arguments}")).json()["pairs"][0]
+            .clone()
+    };
+    let (wrong, right) = (reports(""), reports("--pose-convention opencv-c2w"));
+    assert_ne!(wrong["baseline"], Value::Null);
+    assert_eq!(wrong["baseline"], right["baseline"]);
+    assert_ne!(wrong["verdict"], right["verdict"], "{wrong} {right}");
+}
+
+/// Entries that are left out are listed at the end, and `render` refuses splats that are no numbers.
+#[test]
+fn what_is_left_out_is_listed() {
+    let place = workplace();
+    let at = |name: &str| place.path().join(name);
+    std::fs::write(at("scene/images/view1.png"), "").unwrap();
+    let called = call_in(place.path(), "check scene -o out");
+    let list = "left out of 3 entries of the pose file: 1\n    1 images/view1.png: expected";
+    assert!(called.stderr.contains(list), "{}", called.stderr);
+    let json = call_in(place.path(), "--json info scene").json();
+    assert_eq!(json["left_out"][0]["entry"], 1);
+    assert_eq!(json["frames"][1]["entry"], 2);
+    let header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n\
+                  property float z\nproperty float f_dc_0\nproperty float f_dc_1\nproperty float f_dc_2\n\
+                  property float opacity\nproperty float scale_0\nproperty float scale_1\n\
+                  property float scale_2\nproperty float rot_0\nproperty float rot_1\nproperty float rot_2\n\
+                  property float rot_3\nend_header\n";
+    let rows = "0 0 1 0 0 0 1 0 0 0 1 0 0 0\nnan 0 1 0 0 0 1 0 0 0 1 0 0 0\n";
+    std::fs::write(at("two.ply"), format!("{header}{rows}")).unwrap();
+    let drawn = call_in(place.path(), "render two.ply -o pictures --size 16");
+    assert_eq!(drawn.code, 0, "{}", drawn.stderr);
+    let refused = call_in(place.path(), "render two.ply -o pictures --size 16 --strict");
+    assert_eq!(refused.code, 1);
+    assert!(refused.error().contains("1 of 2 splats"), "{}", refused.error());
+}
