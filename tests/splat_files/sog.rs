@@ -18,7 +18,6 @@ use subsplat::files::{
     save_splats, splat_info,
 };
 use subsplat::scene::metrics::psnr;
-use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::Renderer;
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
@@ -120,7 +119,7 @@ fn a_real_scene_looks_the_same() {
     let camera = load_scene(&folder).unwrap().frames[4].camera;
     let options = RasterOptions::new(Convention::Standard);
     let mut renderer = Renderer::default();
-    let mut picture = |s: &Splats| Rgb::from(&renderer.render(s, &camera, &options));
+    let mut picture = |s: &Splats| renderer.render(s, &camera, &options);
     let before = picture(&splats);
     let v4 = SaveOptions { spz_version: SpzVersion::V4, ..Default::default() };
     let mut found = Vec::new();
@@ -132,7 +131,7 @@ fn a_real_scene_looks_the_same() {
         let bytes = encode_splats(format, &splats, &options).unwrap();
         let (after, _) = subsplat::files::parse_splats(&bytes, "a").unwrap();
         let after = picture(&after);
-        let db = psnr(&before.data, &after.data, before.width, before.height).unwrap();
+        let db = psnr(&before.rgb, &after.rgb, before.width, before.height).unwrap();
         eprintln!("{format:?} {:?}: {} bytes, {db:.2} dB", options.spz_version, bytes.len());
         found.push((bytes.len(), db));
     }
@@ -241,14 +240,14 @@ fn hand_made(version: u64) -> (Value, Vec<(&'static str, Vec<u8>)>) {
 }
 
 fn packed(meta: &Value, planes: &[(&str, Vec<u8>)], prefix: &str, deflated: bool) -> Vec<u8> {
+    let meta_name = format!("{prefix}meta.json");
     let names: Vec<String> = planes.iter().map(|(name, _)| format!("{prefix}{name}")).collect();
     let mut entries: Vec<(&str, Vec<u8>, bool)> = names
         .iter()
         .zip(planes)
         .map(|(name, (_, bytes))| (name.as_str(), bytes.clone(), deflated))
         .collect();
-    let name = format!("{prefix}meta.json");
-    entries.push((&name, meta.to_string().into_bytes(), deflated));
+    entries.push((meta_name.as_str(), meta.to_string().into_bytes(), deflated));
     archive(&entries)
 }
 
