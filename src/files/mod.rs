@@ -4,7 +4,7 @@
 //! Writers write a temporary file and rename it at the end ([`write_atomic`]), so that no
 //! reader sees a partial file. Readers compare every declared size with the bytes that
 //! exist before they allocate. They check the checksums of a container and refuse bytes
-//! after its end.
+//! after its end (a .ply is read with a note on them).
 //!
 //! Foreign conventions end here and in the network's `model/primaries.rs`. Every binary reader has a `parse_*` of
 //! bytes, which tests and fuzz targets call.
@@ -16,8 +16,8 @@ pub mod weights;
 
 pub use splats::{
     SaveOptions, SaveReport, SplatFile, SplatFormat, SplatInfo, Up, encode_splats,
-    encode_splats_with, load_splat_file, load_splats, load_with_comments, parse_splats,
-    save_splats, splat_info,
+    encode_splats_with, is_splat_file, load_splat_file, load_splats, load_with_comments,
+    parse_splats, save_splats, splat_info,
 };
 
 use std::fs::File;

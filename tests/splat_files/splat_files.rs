@@ -442,6 +442,7 @@ fn names_and_magics_choose_the_format() {
         ("a.PLY", SplatFormat::Ply),
         ("a.Glb", SplatFormat::Glb),
         ("a.spz", SplatFormat::Spz),
+        ("a.sog", SplatFormat::Sog),
         ("a.splat", SplatFormat::Splat),
     ] {
         let path = folder.path().join(name);
@@ -455,13 +456,13 @@ fn names_and_magics_choose_the_format() {
             assert_eq!(load_splats(&other).unwrap().len(), 3);
         }
     }
-    for name in ["a.ksplat", "a.compressed.ply", "a.sog", "a"] {
+    for name in ["a.ksplat", "a.compressed.ply", "meta.json", "a"] {
         let e = save_splats(folder.path().join(name), &s, &SaveOptions::default()).unwrap_err();
-        assert!(e.to_string().contains(".ply, .glb, .spz or .splat"), "{e}");
+        assert!(e.to_string().contains(".ply, .glb, .spz, .sog or .splat"), "{e}");
     }
-    std::fs::write(folder.path().join("a.sog"), b"PK\x03\x04rest").unwrap();
-    let e = load_splats(folder.path().join("a.sog")).unwrap_err().to_string();
-    assert!(e.contains("splat-transform"), "{e}");
+    std::fs::write(folder.path().join("a.zip"), b"PK\x03\x04rest").unwrap();
+    let e = load_splats(folder.path().join("a.zip")).unwrap_err().to_string();
+    assert!(e.contains("a whole zip archive (.sog)"), "{e}");
 }
 
 #[test]

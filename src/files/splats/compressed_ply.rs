@@ -67,14 +67,15 @@ pub(super) fn decode(header: Header, source: &mut Source) -> Result<Decoded> {
             _ => header.rows(element, source, |_, _| Ok(()))?,
         }
     }
-    source.finish(header.encoding)?;
+    let after = source.finish(header.encoding)?;
     let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
     let splats = incoming.into_splats(path)?;
     let flavour = format!("compressed ply {}", header.encoding.name());
     let vertex = header.elements.iter().find(|e| e.name == "vertex");
     let packed = |i: usize, e: &Element| PACKED.contains(&e.properties[i].name.as_str());
-    let notes = vertex.and_then(|e| note_of_unread(e, |i| packed(i, e)));
-    Decoded::new(splats, flavour, header.comments, notes.into_iter().collect(), path)
+    let unread = vertex.and_then(|e| note_of_unread(e, |i| packed(i, e)));
+    let notes = [unread, after].into_iter().flatten().collect();
+    Decoded::new(splats, flavour, header.comments, notes, path)
 }
 
 fn need(element: &Element, name: &str, kinds: &[Scalar], source: &Source) -> Result<usize> {

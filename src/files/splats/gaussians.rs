@@ -149,7 +149,8 @@ impl<'a> Outgoing<'a> {
         self.splats.opacity(i).max(0.0) >= self.min_opacity
     }
 
-    fn mean(&self, i: usize) -> [f32; 3] {
+    /// Returns the mean of Gaussian `i` in the axes of the file.
+    pub fn mean(&self, i: usize) -> [f32; 3] {
         let mean = self.splats.mean(i);
         match &self.rotation {
             None => mean,

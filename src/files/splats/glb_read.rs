@@ -4,11 +4,18 @@
 //! translation, uniform scale) and converts glTF's axes (y up, z back) to this crate's.
 //! Quantised attributes are read as the extension allows them. Counts, offsets, strides and
 //! chunk lengths are compared with the bytes before anything is allocated.
+//!
+//! `KHR_gaussian_splatting_compression_spz_2` (a draft of 2026) and its two earlier names hold a
+//! .spz in a buffer view. The numbers of the .spz are those of the attributes, without a change of
+//! axes, as in cesium-native, the draft's one known implementation; both formats are y-up. The
+//! draft's sentence on "left, up, front" axes is half a turn about y away from that. The writer
+//! leaves the attributes uncompressed, since the draft demands version 2 of .spz.
 
 use super::gaussians::{Decoded, HALF_TURN_X, Incoming, Similarity, transform, truncated, u32_at};
 use super::glb::{
     CHUNK_BIN, CHUNK_JSON, EXTENSION, FLOAT, MAGIC, POINTS, SH_DEGREE_MAX, UNSIGNED_SHORT,
 };
+use super::spz;
 use crate::files::{Error, Result};
 use crate::scene::splats::Splats;
 use glam::{DMat3, DMat4, DQuat, DVec3};
@@ -18,6 +25,13 @@ use std::path::Path;
 
 /// Largest depth of the node hierarchy.
 const DEPTH_MAX: usize = 256;
+
+/// Extensions that hold a .spz, newest first. They stand within [`EXTENSION`] or beside it.
+const SPZ: [&str; 3] = [
+    "KHR_gaussian_splatting_compression_spz_2",
+    "KHR_gaussian_splatting_compression_spz",
+    "KHR_spz_gaussian_splats_compression",
+];
 
 /// Longest JSON chunk, bytes; the parsed document may take thirty times as much memory.
 const JSON_MAX: usize = 16 << 20;
@@ -91,11 +105,20 @@ struct Primitive {
     extensions: BTreeMap<String, Extension>,
 }
 
+/// Gaussians of a primitive.
+struct Part {
+    splats: Splats,
+    /// Version of the .spz that held them.
+    spz: Option<u32>,
+}
+
 /// The fields that decide whether the attributes are uncompressed.
 #[derive(Deserialize)]
 struct Extension {
     #[serde(default)]
     extensions: BTreeMap<String, serde_json::Value>,
+    #[serde(rename = "bufferView")]
+    buffer_view: Option<usize>,
 }
 
 #[derive(Deserialize)]
@@ -150,18 +173,21 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     let extras = asset.extras["comments"].as_array();
     comments.extend(extras.into_iter().flatten().filter_map(|c| Some(c.as_str()?.to_owned())));
     let file = File { path, document, binary };
-    let mut parts = Vec::new();
+    let (mut parts, mut flavour) = (Vec::new(), format!("glb {EXTENSION}"));
     // A Gaussian takes at least 14 bytes: more than one for each byte are instances without end.
     let mut budget = bytes.len();
     for (mesh, world) in file.instances()? {
         for part in file.mesh(mesh, &mut budget)? {
-            let mut splats = part;
+            let Part { mut splats, spz } = part;
+            if let Some(version) = spz.filter(|_| parts.is_empty()) {
+                flavour += &format!(", spz {version}");
+            }
             transform(&mut splats, &file.similarity(world)?);
             parts.push(splats);
         }
     }
     let splats = join(parts, path)?;
-    Decoded::new(splats, format!("glb {EXTENSION}"), comments, Vec::new(), path)
+    Decoded::new(splats, flavour, comments, Vec::new(), path)
 }
 
 /// Returns the JSON chunk and the binary one (empty where there is none).
@@ -294,10 +320,17 @@ impl File<'_> {
         })
     }
 
-    fn mesh(&self, mesh: usize, budget: &mut usize) -> Result<Vec<Splats>> {
+    fn mesh(&self, mesh: usize, budget: &mut usize) -> Result<Vec<Part>> {
         let mesh = self.item(&self.document.meshes, mesh, "mesh")?;
         let mut parts = Vec::new();
         for primitive in &mesh.primitives {
+            if let Some(view) = self.spz_view(primitive)? {
+                let (splats, version) = spz::decode_as_stored(self.view_bytes(view)?, self.path)
+                    .map_err(|e| e.at(" the .spz within"))?;
+                self.spend(splats.len(), budget)?;
+                parts.push(Part { splats, spz: Some(version) });
+                continue;
+            }
             let Some(extension) = primitive.extensions.get(EXTENSION) else { continue };
             if let Some(nested) = extension.extensions.keys().next() {
                 return Err(self.bad("attributes without compression", nested.clone()));
@@ -306,9 +339,59 @@ impl File<'_> {
                 let got = format!("mode {:?}", primitive.mode);
                 return Err(self.bad("splats in a primitive of points", got));
             }
-            parts.push(self.primitive(primitive, budget)?);
+            parts.push(Part { splats: self.primitive(primitive, budget)?, spz: None });
         }
         Ok(parts)
+    }
+
+    /// Returns the buffer view with the .spz of `primitive`, if one of [`SPZ`] names it.
+    fn spz_view(&self, primitive: &Primitive) -> Result<Option<usize>> {
+        let base = primitive.extensions.get(EXTENSION);
+        for name in SPZ {
+            let nested = base.and_then(|e| e.extensions.get(name));
+            let view = match (nested, primitive.extensions.get(name)) {
+                (Some(own), _) => own["bufferView"].as_u64().and_then(|i| usize::try_from(i).ok()),
+                (None, Some(own)) => own.buffer_view,
+                (None, None) => continue,
+            };
+            let view = view.ok_or_else(|| self.bad(format!("a bufferView of {name}"), "none"))?;
+            return Ok(Some(view));
+        }
+        Ok(None)
+    }
+
+    /// Returns buffer view `i` with the length of its buffer, which is the file's own BIN chunk.
+    fn view(&self, i: usize) -> Result<(&BufferView, u64)> {
+        let view = self.item(&self.document.buffer_views, i, "bufferView")?;
+        let buffer = self.item(&self.document.buffers, view.buffer, "buffer")?;
+        if view.buffer != 0 || buffer.uri.is_some() {
+            return Err(self.bad("data in the file's own BIN chunk", "another buffer"));
+        }
+        // The chunk is padded to a multiple of 4 (glTF 2.0, section 3.6.1.2).
+        let have = buffer.byte_length;
+        if (self.binary.len() as u64).checked_sub(have).is_none_or(|padding| padding > 3) {
+            let got = self.binary.len().to_string();
+            return Err(self.bad(format!("{have} bytes in the BIN chunk"), got));
+        }
+        Ok((view, have))
+    }
+
+    fn view_bytes(&self, i: usize) -> Result<&[u8]> {
+        let (view, have) = self.view(i)?;
+        let end = view.byte_offset.checked_add(view.byte_length).filter(|end| *end <= have);
+        let end = end.ok_or_else(|| {
+            let got = format!("{} bytes at byte {}", view.byte_length, view.byte_offset);
+            self.bad(format!("bufferView {i} within {have} bytes"), got)
+        })?;
+        Ok(&self.binary[view.byte_offset as usize..end as usize])
+    }
+
+    /// Takes `count` Gaussians from `budget`.
+    fn spend(&self, count: usize, budget: &mut usize) -> Result<()> {
+        *budget = budget
+            .checked_sub(count)
+            .ok_or_else(|| self.bad("fewer Gaussians than bytes", "instances of instances"))?;
+        Ok(())
     }
 
     fn primitive(&self, primitive: &Primitive, budget: &mut usize) -> Result<Splats> {
@@ -341,9 +424,7 @@ impl File<'_> {
                 return Err(self.bad(format!("{count} elements in each attribute"), got));
             }
         }
-        *budget = budget
-            .checked_sub(count)
-            .ok_or_else(|| self.bad("fewer Gaussians than bytes", "instances of instances"))?;
+        self.spend(count, budget)?;
         let mut incoming = Incoming::with_capacity(count, sh_degree);
         for i in 0..count {
             let [x, y, z, w] = quat.get(i);
@@ -382,17 +463,7 @@ impl File<'_> {
                 .bad("floats, or bytes and shorts of 8 or 16 bits", a.component_type.to_string()))
         })?;
         let view = a.buffer_view.ok_or_else(|| at(self.bad("a bufferView", "none")))?;
-        let view = self.item(&d.buffer_views, view, "bufferView").map_err(at)?;
-        let buffer = self.item(&d.buffers, view.buffer, "buffer").map_err(at)?;
-        if view.buffer != 0 || buffer.uri.is_some() {
-            return Err(at(self.bad("data in the file's own BIN chunk", "another buffer")));
-        }
-        // The chunk is padded to a multiple of 4 (glTF 2.0, section 3.6.1.2).
-        let have = buffer.byte_length;
-        if (self.binary.len() as u64).checked_sub(have).is_none_or(|padding| padding > 3) {
-            let got = self.binary.len().to_string();
-            return Err(at(self.bad(format!("{have} bytes in the BIN chunk"), got)));
-        }
+        let (view, have) = self.view(view).map_err(at)?;
         let element = (component.size() * components) as u64;
         let stride = view.byte_stride.unwrap_or(element);
         let start = u128::from(view.byte_offset) + u128::from(a.byte_offset);

@@ -6,11 +6,13 @@
 //! | `.ply` (INRIA 3DGS) | yes | yes | 3 (4 on demand) | ours, or as `up` says |
 //! | `.compressed.ply` (PlayCanvas) | yes | no | | |
 //! | `.glb` (KHR_gaussian_splatting) | yes | yes | 3 | y-up by a node's rotation |
-//! | `.spz` (Niantic, 1 to 4) | yes | version 3 | 3 | y-up by definition |
+//! | `.spz` (Niantic, 1 to 4) | yes | version 3 or 4 | 3 | y-up by definition |
+//! | `.sog` (PlayCanvas, 1 and 2) | yes | version 2 | 3 | ours, or as `up` says |
 //! | `.splat` (antimatter15) | yes | yes | 0 | ours, or as `up` says |
 //! | `.ksplat` (mkkellogg) | yes | no | | |
 //!
-//! "ours": OpenCV axes, y down; viewers of `.ply` and `.splat` rotate the scene themselves.
+//! "ours": OpenCV axes, y down; viewers of `.ply`, `.sog` and `.splat` rotate the scene themselves.
+//! The pictures of a `.sog` are read from a folder as well, with their `meta.json`.
 //! SH of degree 4 are dropped by default, since viewers read 3.
 //!
 //! What a reader applies, leaves out or does not read, it says in a note ([`SplatFile::notes`]).
@@ -22,6 +24,7 @@ mod glb_read;
 pub mod ksplat;
 pub mod ply;
 mod ply_container;
+pub mod sog;
 pub mod splat;
 pub mod spz;
 
@@ -30,9 +33,10 @@ use crate::scene::splats::Splats;
 use gaussians::{Decoded, HALF_TURN_X, Outgoing};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
+use spz::SpzVersion;
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use subsplat_kernels::layout::ALPHA_MIN;
 
@@ -46,6 +50,8 @@ pub enum SplatFormat {
     Glb,
     /// Niantic's `.spz`.
     Spz,
+    /// PlayCanvas' `.sog`.
+    Sog,
     /// antimatter15's `.splat`.
     Splat,
     /// mkkellogg's `.ksplat`.
@@ -53,7 +59,7 @@ pub enum SplatFormat {
 }
 
 /// The formats of [`load_splats`], for errors.
-const KNOWN: &str = "a .ply, .glb, .spz, .splat or .ksplat file";
+const KNOWN: &str = "a .ply, .glb, .spz, .sog, .splat or .ksplat file";
 
 impl SplatFormat {
     /// Detects the format by the file name's extension, in upper or lower case.
@@ -63,13 +69,15 @@ impl SplatFormat {
             "ply" => Self::Ply,
             "glb" => Self::Glb,
             "spz" => Self::Spz,
+            "sog" => Self::Sog,
             "splat" => Self::Splat,
             "ksplat" => Self::Ksplat,
             _ => return None,
         })
     }
 
-    /// Detects the format by the first bytes, where it has a magic number.
+    /// Detects the format by the first bytes, where it has a magic number. That of `.sog` is the one
+    /// of every zip.
     pub fn from_magic(head: &[u8]) -> Option<Self> {
         if head.starts_with(b"ply\n") || head.starts_with(b"ply\r") {
             Some(Self::Ply)
@@ -77,6 +85,8 @@ impl SplatFormat {
             Some(Self::Glb)
         } else if head.starts_with(&spz::MAGIC) || head.starts_with(&[0x1f, 0x8b]) {
             Some(Self::Spz)
+        } else if head.starts_with(b"PK\x03\x04") {
+            Some(Self::Sog)
         } else {
             None
         }
@@ -124,15 +134,17 @@ impl FromStr for Up {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SaveOptions {
     /// Highest SH degree written; `None` is 3. The stored degree and the format (`.ply` 4,
-    /// `.glb` and `.spz` 3, `.splat` 0) limit it.
+    /// `.glb`, `.spz` and `.sog` 3, `.splat` 0) limit it.
     pub sh_degree: Option<usize>,
     /// Gaussians of a lower opacity are left out; 0 keeps all.
     pub min_opacity: f32,
     /// Up direction: rotates means, quaternions and SH. The node of a `.glb` rotates them
     /// back; `.spz` is y-up by definition and refuses `z`.
     pub up: Up,
-    /// Lines for the header of a `.ply`, or the `asset` of a `.glb`.
+    /// Lines for the header of a `.ply`, the `asset` of a `.glb`, or the `meta.json` of a `.sog`.
     pub comments: Vec<String>,
+    /// Version of a `.spz`.
+    pub spz_version: SpzVersion,
 }
 
 /// Report of a written file.
@@ -196,7 +208,30 @@ pub fn load_splat_file(path: impl AsRef<Path>) -> Result<SplatFile> {
     Ok(SplatFile { splats, comments, notes })
 }
 
+/// Returns whether `path` is a splat file by its first bytes or its name, the `meta.json` of a SOG in
+/// a folder, or such a folder.
+pub fn is_splat_file(path: impl AsRef<Path>) -> bool {
+    let path = path.as_ref();
+    if sog_meta(path).is_some() {
+        return true;
+    }
+    let mut head = Vec::new();
+    // The name decides for a file that cannot be read, and the reader says why.
+    let _ = File::open(path).and_then(|f| Read::take(f, 4).read_to_end(&mut head));
+    path.is_file() && format_of(&head, path).is_ok()
+}
+
+/// Returns the `meta.json` of a SOG in a folder: `path` itself, or the one in it.
+fn sog_meta(path: &Path) -> Option<PathBuf> {
+    let meta = if path.is_dir() { path.join(sog::META) } else { path.to_owned() };
+    sog::is_meta(&meta).then_some(meta)
+}
+
 fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
+    if let Some(meta) = sog_meta(path) {
+        let (decoded, bytes) = sog::decode_unpacked(&meta)?;
+        return Ok((SplatFormat::Sog, decoded, bytes));
+    }
     let io = |e| Error::io(path, e);
     let mut file = File::open(path).map_err(io)?;
     let metadata = file.metadata().map_err(io)?;
@@ -220,10 +255,6 @@ fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
 
 /// Detects the format of a file by its first bytes, else by its name.
 fn format_of(head: &[u8], path: &Path) -> Result<SplatFormat> {
-    if head.starts_with(b"PK\x03\x04") {
-        let got = "a zip archive (.sog?): `npx @playcanvas/splat-transform` converts it to .ply";
-        return Err(Error::format(path, KNOWN, got));
-    }
     let head = &head[..head.len().min(4)];
     SplatFormat::from_magic(head)
         .or_else(|| SplatFormat::from_name(path))
@@ -235,6 +266,7 @@ fn decode_bytes(format: SplatFormat, bytes: &[u8], path: &Path) -> Result<Decode
         SplatFormat::Ply => ply::decode(&mut { bytes }, bytes.len() as u64, path),
         SplatFormat::Glb => glb_read::decode(bytes, path),
         SplatFormat::Spz => spz::decode(bytes, path),
+        SplatFormat::Sog => sog::decode(bytes, path),
         SplatFormat::Splat => splat::decode(bytes, path),
         SplatFormat::Ksplat => ksplat::decode(bytes, path),
     }
@@ -272,8 +304,8 @@ impl Splats {
 
 /// Writes a splat file in the format of its extension, atomically.
 ///
-/// `.ply` and `.glb` are lossless (float) but for SH above the degree written; `.spz` and
-/// `.splat` quantise ([`self::spz`], [`self::splat`]).
+/// `.ply` and `.glb` are lossless (float) but for SH above the degree written; `.spz`, `.sog` and
+/// `.splat` quantise ([`self::spz`], [`self::sog`], [`self::splat`]).
 ///
 /// # Errors
 /// An extension of no writable format, numbers that are not finite (the first Gaussian is
@@ -291,7 +323,8 @@ fn write_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Result<S
     let format = SplatFormat::from_name(path)
         .filter(|f| *f != SplatFormat::Ksplat && !name.ends_with(".compressed.ply"))
         .ok_or_else(|| {
-            Error::format(path, "a name that ends in .ply, .glb, .spz or .splat", name.clone())
+            let expected = "a name that ends in .ply, .glb, .spz, .sog or .splat";
+            Error::format(path, expected, name.clone())
         })?;
     let plan = Plan::new(format, splats, options, path)?;
     write_atomic(path, |f| plan.write(f, options))?;
@@ -363,6 +396,7 @@ impl<'a> Plan<'a> {
             SplatFormat::Ply => survey(rotation, 4)?,
             SplatFormat::Glb => survey(rotation, glb::SH_DEGREE_MAX)?,
             SplatFormat::Splat => survey(rotation, 0)?,
+            SplatFormat::Sog => survey(rotation, sog::SH_DEGREE_MAX)?,
             SplatFormat::Spz | SplatFormat::Ksplat if options.up == Up::Z => {
                 return Err(Error::format(path, "up keep or y (.spz is y-up by definition)", "z"));
             }
@@ -372,6 +406,9 @@ impl<'a> Plan<'a> {
             SplatFormat::Glb => Some(glb::Plan::new(&out, options.up, &options.comments, path)?),
             _ => None,
         };
+        if format == SplatFormat::Sog {
+            sog::check(&out, path)?;
+        }
         let fraction_bits = match format {
             SplatFormat::Spz => spz::fraction_bits(&out, path)?,
             _ => 0,
@@ -384,8 +421,9 @@ impl<'a> Plan<'a> {
             (_, Some(glb)) => glb.write(f, &self.out),
             (SplatFormat::Ply | SplatFormat::Glb, None) => ply::write(f, &self.out, options),
             (SplatFormat::Splat, None) => splat::write(f, &self.out),
+            (SplatFormat::Sog, None) => sog::write(f, &self.out, &options.comments),
             (SplatFormat::Spz | SplatFormat::Ksplat, None) => {
-                spz::write(f, &self.out, self.fraction_bits)
+                spz::write(f, &self.out, self.fraction_bits, options.spz_version)
             }
         }
     }

@@ -10,8 +10,16 @@
 //!
 //! The reader accepts ascii and both byte orders, any property order and number type, 0, 9,
 //! 24, 45 or 72 `f_rest`, and `red green blue` in place of `f_dc` (nerfstudio). It applies
-//! `filter_3D` (Mip-Splatting), names the vertex properties that it does not read in a note,
-//! skips other elements, and refuses bytes after the last element.
+//! `filter_3D` (Mip-Splatting), skips other elements, and says in notes which vertex properties
+//! and how many bytes at the end it does not read. Dialects:
+//!
+//! * Without `scale_2`: the discs of 2DGS. σ₂ = 1e-6, the value that its authors give for other
+//!   viewers (hbb1/2d-gaussian-splatting, issue 94).
+//! * Elements `vertex_0`, `vertex_1`, …: one for each SH degree (graphdeco-inria/reduced-3dgs).
+//!   Its 16-bit files declare halves as `short`, since plyfile has no half type: where all of `x y
+//!   z`, `opacity`, `scale_*` and `rot_*` are 16-bit integers, they are the bits of halves. Its files
+//!   with codebooks are refused.
+//!
 //! `compressed_ply.rs` reads PlayCanvas' packed files.
 
 use super::gaussians::{Decoded, Incoming, Outgoing, dc_from_colour, logit, sigmoid};
@@ -19,11 +27,16 @@ use super::ply_container::{Element, Header, Scalar, Source};
 use super::{SaveOptions, Up, compressed_ply};
 use crate::files::{Error, Result};
 use crate::scene::splats::Splats;
+use half::f16;
 use std::io::{BufRead, Write};
 use std::path::Path;
 
 /// Number of `f_rest` properties by SH degree.
 pub(super) const REST_COUNTS: [usize; 5] = [0, 9, 24, 45, 72];
+/// σ of the third axis of 2DGS, world units.
+const DISC: f64 = 1e-6;
+/// Element of files with codebooks (reduced-3dgs).
+const CODEBOOKS: &str = "codebook_centers";
 /// Gaussians per write: about 250 KiB at degree 3.
 const BLOCK: usize = 1024;
 /// Property of Mip-Splatting: standard deviation of the filter of each Gaussian, world units.
@@ -39,8 +52,8 @@ const NAME_CHARS_MAX: usize = 40;
 /// `name` is for errors.
 ///
 /// # Errors
-/// Not a PLY, not a splat file, a truncated file, a count that the bytes do not bear out,
-/// bytes after the last element, no Gaussian with finite numbers and a rotation.
+/// Not a PLY, not a splat file, a truncated file, a count that the bytes do not bear out, no
+/// Gaussian with finite numbers and a rotation.
 pub fn parse_ply(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
     let mut reader = bytes;
     Ok(decode(&mut reader, bytes.len() as u64, name.as_ref())?.splats)
@@ -53,21 +66,45 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
     if compressed_ply::is_compressed(&header) {
         return compressed_ply::decode(header, &mut source);
     }
+    let parts = vertex_elements(&header, path)?;
     let (mut incoming, mut notes) = (None, Vec::new());
-    for element in &header.elements {
-        if element.name == "vertex" && incoming.is_none() {
-            let layout = Layout::of(element, path)?;
-            incoming = Some(read_vertices(&header, element, &layout, &mut source)?);
-            notes = layout.notes(element);
-        } else {
+    for (i, element) in header.elements.iter().enumerate() {
+        if !parts.contains(&i) {
             header.rows(element, &mut source, |_, _| Ok(()))?;
+            continue;
+        }
+        let layout = Layout::of(element, path)?;
+        let count = header.checked_count(element, &source)?;
+        let incoming = incoming.get_or_insert_with(|| Incoming::with_capacity(count, 0));
+        read_vertices(&header, element, &layout, &mut source, incoming)?;
+        for note in layout.notes(element) {
+            if !notes.contains(&note) {
+                notes.push(note);
+            }
         }
     }
-    source.finish(header.encoding)?;
+    notes.extend(source.finish(header.encoding)?);
     let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
     let splats = incoming.into_splats(path)?;
     let flavour = format!("ply {}", header.encoding.name());
     Decoded::new(splats, flavour, header.comments, notes, path)
+}
+
+/// Returns the indices of the elements with Gaussians: the first `vertex`, else all of `vertex_0`,
+/// `vertex_1`, ….
+fn vertex_elements(header: &Header, path: &Path) -> Result<Vec<usize>> {
+    if let Some(i) = header.elements.iter().position(|e| e.name == "vertex") {
+        return Ok(vec![i]);
+    }
+    if header.elements.iter().any(|e| e.name == CODEBOOKS) {
+        let expected = "numbers, not indices into codebooks: save the file without quantisation";
+        return Err(Error::format(path, expected, format!("an element `{CODEBOOKS}`")));
+    }
+    let group = |name: &str| {
+        name.strip_prefix("vertex_").is_some_and(|degree| degree.parse::<u32>().is_ok())
+    };
+    let all = header.elements.iter().enumerate();
+    Ok(all.filter(|(_, e)| group(&e.name)).map(|(i, _)| i).collect())
 }
 
 /// Names the properties of `element` that are neither read nor redundant, for a note.
@@ -103,7 +140,9 @@ fn filtered(scale: [f64; 3], filter: f64) -> ([f64; 3], f64) {
 /// Indices of the properties of a row.
 struct Layout {
     mean: [usize; 3],
-    scale: [usize; 3],
+    scale: [usize; 2],
+    /// `scale_2`; without it the Gaussians are discs.
+    thickness: Option<usize>,
     quat: [usize; 4],
     opacity: usize,
     dc: [usize; 3],
@@ -112,6 +151,8 @@ struct Layout {
     rest: Vec<usize>,
     /// [`FILTER`].
     filter: Option<usize>,
+    /// The 16-bit integers are the bits of halves.
+    half_bits: bool,
 }
 
 impl Layout {
@@ -124,14 +165,14 @@ impl Layout {
             })
         };
         let mean = ["x", "y", "z"].map(&mut find);
-        let scale = ["scale_0", "scale_1", "scale_2"].map(&mut find);
+        let scale = ["scale_0", "scale_1"].map(&mut find);
         let quat = ["rot_0", "rot_1", "rot_2", "rot_3"].map(&mut find);
         let opacity = find("opacity");
         let colours = ["red", "green", "blue"].map(|n| element.position(n));
         let (dc, colour_range) = match colours {
             [Some(r), Some(g), Some(b)] if element.position("f_dc_0").is_none() => {
                 let range = match element.properties[r].kind {
-                    Scalar::F32 | Scalar::F64 => 1.0,
+                    Scalar::F16 | Scalar::F32 | Scalar::F64 => 1.0,
                     Scalar::U16 => 65535.0,
                     _ => 255.0,
                 };
@@ -140,7 +181,7 @@ impl Layout {
             _ => (["f_dc_0", "f_dc_1", "f_dc_2"].map(&mut find), None),
         };
         if !missing.is_empty() {
-            let what = if missing.len() >= 8 { "; a point cloud or mesh, not splats?" } else { "" };
+            let what = if missing.len() >= 7 { "; a point cloud or mesh, not splats?" } else { "" };
             let got = format!("a vertex without {}{what}", missing.join(", "));
             return Err(Error::format(path, "the properties of a Gaussian splat file", got));
         }
@@ -153,14 +194,41 @@ impl Layout {
             return Err(Error::format(path, "0, 9, 24, 45 or 72 properties f_rest_0, …", got));
         }
         let filter = element.position(FILTER);
-        Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest, filter })
+        let thickness = element.position("scale_2");
+        let is_16_bit =
+            |i: &usize| matches!(element.properties[*i].kind, Scalar::I16 | Scalar::U16);
+        let half_bits = [&mean[..], &scale, &quat, &[opacity]].concat().iter().all(is_16_bit);
+        Ok(Self {
+            mean,
+            scale,
+            thickness,
+            quat,
+            opacity,
+            dc,
+            colour_range,
+            rest,
+            filter,
+            half_bits,
+        })
     }
 
     fn reads(&self, i: usize) -> bool {
-        let Self { mean, scale, quat, opacity, dc, rest, filter, .. } = self;
+        let Self { mean, scale, thickness, quat, opacity, dc, rest, filter, .. } = self;
         [&mean[..], scale, quat, dc, rest].iter().any(|all| all.contains(&i))
             || *opacity == i
-            || *filter == Some(i)
+            || [filter, thickness].contains(&&Some(i))
+    }
+
+    /// Returns property `i` of a row `v`.
+    fn value(&self, element: &Element, v: &[f64], i: usize) -> f64 {
+        if !self.half_bits {
+            return v[i];
+        }
+        match element.properties[i].kind {
+            Scalar::I16 => f64::from(f16::from_bits(v[i] as i16 as u16)),
+            Scalar::U16 => f64::from(f16::from_bits(v[i] as u16)),
+            _ => v[i],
+        }
     }
 
     /// Notes on what is applied and what is not read.
@@ -168,42 +236,76 @@ impl Layout {
         let filter = self.filter.map(|_| {
             format!("the property {FILTER} (Mip-Splatting) is applied to sizes and opacities")
         });
-        filter.into_iter().chain(note_of_unread(element, |i| self.reads(i))).collect()
+        let disc = self.thickness.is_none().then(|| {
+            format!(
+                "without scale_2 the splats are flat discs (2DGS); they get a thickness of {DISC} of \
+                 the scene's unit"
+            )
+        });
+        let halves = self.half_bits.then(|| {
+            "the 16-bit integers of x, y, z, scale, rot and opacity are read as half-precision \
+             floats, which reduced-3dgs stores in this way"
+                .to_owned()
+        });
+        let codes = self.note_of_codes(element);
+        let notes = [filter, disc, halves, codes, note_of_unread(element, |i| self.reads(i))];
+        notes.into_iter().flatten().collect()
+    }
+
+    /// Names the properties whose integers are more likely codes than values.
+    fn note_of_codes(&self, element: &Element) -> Option<String> {
+        let Self { scale, thickness, quat, opacity, rest, .. } = self;
+        let dc = if self.colour_range.is_none() { &self.dc[..] } else { &[] };
+        let all = [&scale[..], quat, dc, rest, &[*opacity]].concat();
+        let is_code = |i: &&usize| match element.properties[**i].kind {
+            Scalar::F16 | Scalar::F32 | Scalar::F64 => false,
+            Scalar::I16 | Scalar::U16 => !self.half_bits,
+            _ => true,
+        };
+        let mut codes = all.iter().chain(thickness).filter(is_code);
+        let first = &element.properties[*codes.next()?].name;
+        let more = match codes.count() {
+            0 => String::new(),
+            n => format!(" and {n} more"),
+        };
+        Some(format!("the integers of {first}{more} are taken as values, not as codes"))
     }
 }
 
+/// Reads the rows of `element` into `incoming`.
 fn read_vertices(
     header: &Header,
     element: &Element,
     layout: &Layout,
     source: &mut Source,
-) -> Result<Incoming> {
-    let mut incoming = Incoming::with_capacity(header.checked_count(element, source)?, 0);
+    incoming: &mut Incoming,
+) -> Result<()> {
     let mut rest = vec![0.0f32; layout.rest.len()];
-    header.rows(element, source, |_, v| {
+    header.rows(element, source, |_, row| {
+        let v = |i: usize| layout.value(element, row, i);
         for (r, &i) in rest.iter_mut().zip(&layout.rest) {
-            *r = v[i] as f32;
+            *r = v(i) as f32;
         }
         // Degrees that are zero in every row take no memory and no time.
         incoming.raise_degree(used_degree(&rest));
-        let (scale, factor) =
-            filtered(layout.scale.map(|i| v[i].exp()), layout.filter.map_or(0.0, |i| v[i]));
+        let [a, b] = layout.scale.map(|i| v(i).exp());
+        let c = layout.thickness.map_or_else(|| DISC.min(a).min(b), |i| v(i).exp());
+        let (scale, factor) = filtered([a, b, c], layout.filter.map_or(0.0, v));
         let sh = incoming.push(
-            layout.mean.map(|i| v[i] as f32),
-            layout.quat.map(|i| v[i] as f32),
+            layout.mean.map(|i| v(i) as f32),
+            layout.quat.map(|i| v(i) as f32),
             scale.map(|s| s as f32),
-            (sigmoid(v[layout.opacity] as f32) * factor) as f32,
+            (sigmoid(v(layout.opacity) as f32) * factor) as f32,
         );
         for (h, i) in sh.iter_mut().zip(layout.dc) {
             *h = match layout.colour_range {
-                None => v[i] as f32,
-                Some(range) => dc_from_colour(v[i] / range),
+                None => v(i) as f32,
+                Some(range) => dc_from_colour(v(i) / range),
             };
         }
         rest_to_set(&rest, sh);
         Ok(())
-    })?;
-    Ok(incoming)
+    })
 }
 
 /// Lowest SH degree that holds all of channel-major `f_rest` that is not zero.
@@ -216,7 +318,7 @@ fn used_degree(rest: &[f32]) -> usize {
 /// Writes channel-major `f_rest[3, D − 1]` to a set `[D, 3]` after its constant term.
 pub(super) fn rest_to_set(rest: &[f32], set: &mut [f32]) {
     let per_channel = rest.len() / 3;
-    for (j, h) in set[3..].chunks_exact_mut(3).enumerate() {
+    for (j, h) in set[3..].chunks_exact_mut(3).enumerate().take(per_channel) {
         for (c, v) in h.iter_mut().enumerate() {
             *v = rest[c * per_channel + j];
         }

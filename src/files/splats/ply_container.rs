@@ -1,10 +1,13 @@
 //! The PLY container: header, elements, rows of numbers; ascii and binary of either byte
 //! order. It is read as a stream, so that a file is not in memory twice.
 //!
-//! Declared counts are compared with the remaining bytes before anything is allocated.
+//! Declared counts are compared with the remaining bytes before anything is allocated. Bytes after
+//! the last element are not read, and a note gives their number. The types `half` and `float16`
+//! are read beside the eight of the format: trainers that compress their scenes declare them.
 //! Source: Turk, "The PLY Polygon File Format".
 
 use crate::files::{Error, Result};
+use half::f16;
 use std::io::{BufRead, Read};
 use std::path::Path;
 
@@ -68,23 +71,23 @@ impl<'a> Source<'a> {
         Ok(line)
     }
 
-    /// Refuses bytes after the last element; blank lines may follow the rows of an ascii file.
-    pub fn finish(&mut self, encoding: Encoding) -> Result<()> {
-        let expected = "the end of the file after the last element";
-        while self.left > 0 {
-            if encoding != Encoding::Ascii {
-                return Err(Error::format(
-                    self.path,
-                    expected,
-                    format!("{} more bytes", self.left),
-                ));
+    /// Makes a note of the bytes after the last element, which are not read; blank lines may follow
+    /// the rows of an ascii file.
+    pub fn finish(&mut self, encoding: Encoding) -> Result<Option<String>> {
+        let mut after = self.left;
+        while encoding == Encoding::Ascii && self.left > 0 {
+            let mut line = Vec::new();
+            let mut limited = Read::take(&mut *self.reader, LINE_MAX.min(self.left));
+            limited.read_until(b'\n', &mut line).map_err(|e| Error::io(self.path, e))?;
+            if line.is_empty() || !line.iter().all(u8::is_ascii_whitespace) {
+                break;
             }
-            let line = self.line(expected)?;
-            if !line.iter().all(u8::is_ascii_whitespace) {
-                return Err(self.bad_line(expected, &line));
-            }
+            self.left -= line.len() as u64;
+            after = self.left;
         }
-        Ok(())
+        Ok((after > 0).then(|| {
+            format!("{after} bytes after the last row that the header announces are not read")
+        }))
     }
 
     fn bad_line(&self, expected: impl Into<String>, got: &[u8]) -> Error {
@@ -102,6 +105,8 @@ pub(super) enum Scalar {
     U16,
     I32,
     U32,
+    /// IEEE 754 binary16, which the PLY of Turk lacks.
+    F16,
     F32,
     F64,
 }
@@ -115,6 +120,7 @@ impl Scalar {
             "ushort" | "uint16" => Self::U16,
             "int" | "int32" => Self::I32,
             "uint" | "uint32" => Self::U32,
+            "half" | "float16" => Self::F16,
             "float" | "float32" => Self::F32,
             "double" | "float64" => Self::F64,
             _ => return None,
@@ -125,7 +131,7 @@ impl Scalar {
     fn size(self) -> usize {
         match self {
             Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
+            Self::I16 | Self::U16 | Self::F16 => 2,
             Self::I32 | Self::U32 | Self::F32 => 4,
             Self::F64 => 8,
         }
@@ -149,6 +155,7 @@ impl Scalar {
             Self::U16 => f64::from(u16::from_le_bytes(word(b, encoding))),
             Self::I32 => f64::from(i32::from_le_bytes(word(b, encoding))),
             Self::U32 => f64::from(u32::from_le_bytes(word(b, encoding))),
+            Self::F16 => f64::from(f16::from_le_bytes(word(b, encoding))),
             Self::F32 => f64::from(f32::from_le_bytes(word(b, encoding))),
             Self::F64 => f64::from_le_bytes(word(b, encoding)),
         }
@@ -366,7 +373,7 @@ fn read_property(source: &Source, line: &[u8], mut words: Words) -> Result<Prope
     let first = words.next();
     let (list, kind) = if first == Some("list") {
         let length = scalar(words.next())?;
-        if matches!(length, Scalar::F32 | Scalar::F64) {
+        if matches!(length, Scalar::F16 | Scalar::F32 | Scalar::F64) {
             return Err(source.bad_line("an integer type for a list's length", line));
         }
         (Some(length), scalar(words.next())?)

@@ -1,5 +1,5 @@
 //! Niantic's `.spz`: about 20 bytes per Gaussian at degree 0 and 64 at degree 3, packed by
-//! attribute and compressed. Reads versions 1 to 4, writes version 3.
+//! attribute and compressed. Reads versions 1 to 4, writes version 3 or 4.
 //!
 //! Header, little-endian: magic `NGSP`, version u32, count u32, SH degree u8,
 //! fractional bits u8, flags u8, one byte (4: number of streams). Then, for all
@@ -12,7 +12,8 @@
 //! 32-byte header with the offset of a table of (compressed, uncompressed) u64 pairs, one
 //! zstd stream for each attribute. Bit 1 of the flags announces extension records, after
 //! the Gaussians (1 to 3) or between header and table (4). The reader skips them. It checks
-//! every checksum, and that nothing follows the data.
+//! every checksum, and that nothing follows the data. Version 3 is the default of the writer: more
+//! viewers read it, and `ruzstd` compresses less than gzip does.
 //!
 //! Axes: x right, y up, z back; half a turn about x from ours.
 //! Source: the README and extensions/README of nianticlabs/spz, splat-transform's files.
@@ -27,6 +28,8 @@ use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
 use glam::DVec3;
 use half::f16;
+use ruzstd::encoding::{CompressionLevel, compress_to_vec};
+use serde::{Deserialize, Serialize};
 use std::io::{BufWriter, Read, Write};
 use std::path::Path;
 use subsplat_kernels::layout::sh_coefficients;
@@ -49,6 +52,17 @@ const COLOUR_SCALE: f64 = 0.15;
 const FIXED_MAX: f64 = 8_388_607.0;
 /// Largest number of fractional bits that is written.
 const FRACTION_MAX: i32 = 20;
+
+/// Version of a written file.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SpzVersion {
+    /// One gzip stream.
+    #[default]
+    V3,
+    /// One zstd stream for each attribute.
+    V4,
+}
 
 /// Reads a `.spz` from memory. `name` is for errors.
 ///
@@ -119,6 +133,14 @@ impl Header {
 type Columns = [Vec<u8>; 6];
 
 pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
+    let (mut splats, version) = decode_as_stored(bytes, path)?;
+    let by = Similarity { scale: 1.0, rotation: HALF_TURN_X, translation: DVec3::ZERO };
+    transform(&mut splats, &by);
+    Decoded::new(splats, format!("spz {version}"), Vec::new(), Vec::new(), path)
+}
+
+/// Reads the Gaussians in the file's axes, and its version.
+pub(super) fn decode_as_stored(bytes: &[u8], path: &Path) -> Result<(Splats, u32)> {
     let (header, columns) = if bytes.starts_with(&[0x1f, 0x8b]) {
         inflate_gzip(bytes, path)?
     } else {
@@ -135,11 +157,7 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
         };
         (header, columns)
     };
-    let mut splats = gaussians(&header, &columns).into_splats(path)?;
-    let by = Similarity { scale: 1.0, rotation: HALF_TURN_X, translation: DVec3::ZERO };
-    transform(&mut splats, &by);
-    let flavour = format!("spz {}", header.version);
-    Decoded::new(splats, flavour, Vec::new(), Vec::new(), path)
+    Ok((gaussians(&header, &columns).into_splats(path)?, header.version))
 }
 
 /// Reads what follows the Gaussians of versions 1 to 3 to its end, at most `limit` bytes:
@@ -416,47 +434,86 @@ pub(super) fn fraction_bits(out: &Outgoing, path: &Path) -> Result<u32> {
     Ok(bits.clamp(0, FRACTION_MAX) as u32)
 }
 
-/// Writes version 3, in one pass over `out` for each attribute.
+/// Writes a file, in one pass over `out` for each attribute.
 ///
 /// SH coefficients have all 8 bits; the reference encoder rounds to 5 and 4 bits for size.
-pub(super) fn write(file: &mut dyn Write, out: &Outgoing, bits: u32) -> std::io::Result<()> {
-    // Buffered: calls of the encoder for single bytes cost more than their compression.
-    let encoder = GzEncoder::new(file, flate2::Compression::default());
-    let mut gzip = BufWriter::with_capacity(1 << 16, encoder);
+pub(super) fn write(
+    file: &mut dyn Write,
+    out: &Outgoing,
+    bits: u32,
+    version: SpzVersion,
+) -> std::io::Result<()> {
+    let attributes = if out.sh_degree == 0 { 5 } else { 6 };
     let mut head = MAGIC.to_vec();
-    head.extend(3u32.to_le_bytes());
+    let (number, streams) = match version {
+        SpzVersion::V3 => (3u32, 0),
+        SpzVersion::V4 => (4, attributes),
+    };
+    head.extend(number.to_le_bytes());
     // `fraction_bits` has checked the count.
 
     head.extend((out.count as u32).to_le_bytes());
-    head.extend([out.sh_degree as u8, bits as u8, 0, 0]);
-    gzip.write_all(&head)?;
+    head.extend([out.sh_degree as u8, bits as u8, 0, streams]);
+    match version {
+        SpzVersion::V3 => {
+            // Buffered: calls of the encoder for single bytes cost more than their compression.
+            let encoder = GzEncoder::new(file, flate2::Compression::default());
+            let mut gzip = BufWriter::with_capacity(1 << 16, encoder);
+            gzip.write_all(&head)?;
+            (0..attributes).try_for_each(|a| write_attribute(&mut gzip, out, bits, a))?;
+            gzip.into_inner()?.finish().map(drop)
+        }
+        SpzVersion::V4 => {
+            head.extend((HEADER_V4 as u32).to_le_bytes());
+            head.resize(HEADER_V4, 0);
+            let (mut table, mut streams) = (Vec::new(), Vec::new());
+            for attribute in 0..attributes {
+                let mut column = Vec::new();
+                write_attribute(&mut column, out, bits, attribute)?;
+                let stream = compress_to_vec(&column[..], CompressionLevel::Fastest);
+                table.extend((stream.len() as u64).to_le_bytes());
+                table.extend((column.len() as u64).to_le_bytes());
+                streams.push(stream);
+            }
+            file.write_all(&head)?;
+            file.write_all(&table)?;
+            streams.iter().try_for_each(|stream| file.write_all(stream))
+        }
+    }
+}
+
+/// Writes one attribute of all Gaussians, in the order of [`Header::sizes`].
+fn write_attribute(
+    to: &mut dyn Write,
+    out: &Outgoing,
+    bits: u32,
+    attribute: u8,
+) -> std::io::Result<()> {
     let scale = f64::from(1u32 << bits);
     let byte = |v: f64| v.round().clamp(0.0, 255.0) as u8;
     let floats = 3 * sh_coefficients(out.sh_degree);
-    for attribute in 0..6 {
-        let mut visitor = out.visitor();
-        for i in out.kept() {
-            let g = visitor.at(i)?;
-            match attribute {
-                0 => {
-                    for v in g.mean {
-                        let fixed = (f64::from(v) * scale).round().clamp(-FIXED_MAX, FIXED_MAX);
-                        gzip.write_all(&(fixed as i32).to_le_bytes()[..3])?;
-                    }
+    let mut visitor = out.visitor();
+    for i in out.kept() {
+        let g = visitor.at(i)?;
+        match attribute {
+            0 => {
+                for v in g.mean {
+                    let fixed = (f64::from(v) * scale).round().clamp(-FIXED_MAX, FIXED_MAX);
+                    to.write_all(&(fixed as i32).to_le_bytes()[..3])?;
                 }
-                1 => gzip.write_all(&[unit_byte(f64::from(g.opacity))])?,
-                2 => gzip.write_all(
-                    &[0, 1, 2].map(|c| unit_byte(COLOUR_SCALE * f64::from(g.sh[c]) + 0.5)),
-                )?,
-                3 => gzip.write_all(&g.scale.map(|s| byte(16.0 * (f64::from(s).ln() + 10.0))))?,
-                4 => gzip.write_all(&pack_rotation(g.quat))?,
-                _ => {
-                    for v in &g.sh[3..floats] {
-                        gzip.write_all(&[byte(f64::from(*v) * 128.0 + 128.0)])?;
-                    }
+            }
+            1 => to.write_all(&[unit_byte(f64::from(g.opacity))])?,
+            2 => to.write_all(
+                &[0, 1, 2].map(|c| unit_byte(COLOUR_SCALE * f64::from(g.sh[c]) + 0.5)),
+            )?,
+            3 => to.write_all(&g.scale.map(|s| byte(16.0 * (f64::from(s).ln() + 10.0))))?,
+            4 => to.write_all(&pack_rotation(g.quat))?,
+            _ => {
+                for v in &g.sh[3..floats] {
+                    to.write_all(&[byte(f64::from(*v) * 128.0 + 128.0)])?;
                 }
             }
         }
     }
-    gzip.into_inner()?.finish().map(drop)
+    Ok(())
 }

@@ -8,7 +8,7 @@ use anyhow::{Result, bail};
 use serde_json::json;
 use subsplat::files::poses::reading::SceneOptions;
 use subsplat::files::splats::ply::is_own_comment;
-use subsplat::files::{SaveOptions, save_splats};
+use subsplat::files::{SaveOptions, SplatFormat, save_splats};
 use subsplat::finish::reduce;
 use subsplat::scene::render::{
     Renderer, camera_of_comments, comments_without_camera, options_of_comments, origin_of_comments,
@@ -26,6 +26,10 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             "--cameras: only .html files hold cameras, got {}; --gaussians uses them too",
             args.out.display()
         );
+    }
+    let spz = SplatFormat::from_name(&args.out) == Some(SplatFormat::Spz);
+    if args.spz_version.is_some() && !spz {
+        bail!("--spz-version: only with a .spz, got {}", args.out.display());
     }
     let (mut splats, mut comments) = progress.stage("scene", |_| render::load(&file, false))?;
     comments.retain(|comment| !is_own_comment(comment));
@@ -64,6 +68,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
         min_opacity: args.content.min_opacity,
         up: args.up.map(Into::into).unwrap_or_default(),
         comments: kept,
+        spz_version: args.spz_version.unwrap_or_default(),
     };
     let report = progress.stage("writing", |_| {
         if !html {

@@ -8,7 +8,7 @@ use std::path::Path;
 use subsplat::files::photos::image::probe;
 use subsplat::files::photos::photograph::probe_photograph;
 use subsplat::files::poses::scene::{Scene, load_scene};
-use subsplat::files::{SplatFormat, SplatInfo, splat_info};
+use subsplat::files::{SplatInfo, is_splat_file, splat_info};
 use subsplat::network::config::Config;
 use subsplat::network::model::weights::Weights;
 
@@ -16,15 +16,17 @@ use subsplat::network::model::weights::Weights;
 pub fn info(args: &InfoArgs, answer: Answer) -> Result<()> {
     let path = args.file.as_path();
     let metadata = std::fs::metadata(path).with_context(|| path.display().to_string())?;
-    let report = if metadata.is_dir() { scene(path, answer)? } else { file(path, answer)? };
+    let report = if is_splat_file(path) {
+        splats(path, answer)?
+    } else if metadata.is_dir() {
+        scene(path, answer)?
+    } else {
+        file(path, answer)?
+    };
     answer.finish(&report)
 }
 
 fn file(path: &Path, answer: Answer) -> Result<Value> {
-    let head = head(path)?;
-    if SplatFormat::from_magic(&head).is_some() || SplatFormat::from_name(path).is_some() {
-        return splats(path, answer);
-    }
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match extension.as_str() {
         "safetensors" => weights(path, answer),
@@ -33,20 +35,11 @@ fn file(path: &Path, answer: Answer) -> Result<Value> {
             picture(path, answer)
         }
         _ => bail!(
-            "{}: expected a splat file (.ply .glb .spz .splat .ksplat), weights (.safetensors), a \
+            "{}: expected a splat file (.ply .glb .spz .sog .splat .ksplat), weights (.safetensors), a \
              picture, a pose file or a scene folder, got `.{extension}`",
             path.display()
         ),
     }
-}
-
-/// Reads the first 64 bytes of a file.
-pub fn head(path: &Path) -> Result<Vec<u8>> {
-    use std::io::Read;
-    let mut head = Vec::new();
-    let file = std::fs::File::open(path).with_context(|| path.display().to_string())?;
-    file.take(64).read_to_end(&mut head).with_context(|| path.display().to_string())?;
-    Ok(head)
 }
 
 fn splats(path: &Path, answer: Answer) -> Result<Value> {

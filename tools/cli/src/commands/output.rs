@@ -298,6 +298,8 @@ fn bytes_at_most(format: SceneFormatArg, count: u64, stored: usize, asked: Optio
         SceneFormatArg::Glb => count * (4 * (11 + 3 + kept) + 8),
         SceneFormatArg::Splat => count * 32,
         SceneFormatArg::Spz => count * (20 + kept),
+        // Pictures of 19 bytes a splat, and the palette of 65,536 sets of SH.
+        SceneFormatArg::Sog => count * 20 + count.min(65536) * kept,
         SceneFormatArg::Html => count * (20 + kept) * 4 / 3,
     }
 }

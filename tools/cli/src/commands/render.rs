@@ -11,12 +11,12 @@ use clap::ValueEnum;
 use glam::{DVec3, Mat4, Vec3};
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use subsplat::files::load_splat_file;
 use subsplat::files::photos::image::{probe, save_depth_png, save_png};
 use subsplat::files::photos::photograph::list_photographs;
 use subsplat::files::poses::cameras_json::is_cameras_json;
 use subsplat::files::poses::reading::SceneOptions;
 use subsplat::files::poses::scene::{is_scene, load_cameras_with, load_scene_with};
+use subsplat::files::{is_splat_file, load_splat_file};
 use subsplat::scene::pictures::{Depth, Rgb};
 use subsplat::scene::render::{
     Renderer, camera_of_comments, options_of_comments, origin_of_comments,
@@ -126,6 +126,10 @@ pub fn scene_file(path: &Path) -> Result<PathBuf> {
             path.display()
         );
         return Ok(path.to_owned());
+    }
+    // The pictures of a .sog.
+    if is_splat_file(path) {
+        return Ok(path.join("meta.json"));
     }
     let readable = SceneFormatArg::value_variants().iter().filter(|f| **f != SceneFormatArg::Html);
     let files = readable.map(|f| path.join(f.file_name()));

@@ -1,6 +1,7 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
 use super::args::{InputSizeArg, PictureSizeArg};
+use subsplat::files::splats::spz::SpzVersion;
 use subsplat::reconstruct::{FisheyeCurve, FisheyeLens, Projection};
 use subsplat::{Density, Refine};
 use subsplat_kernels::camera::Intrinsics;
@@ -113,6 +114,11 @@ pub fn sh_degree(text: &str) -> Result<usize, String> {
 /// Parses the SH degree of a file.
 pub fn file_sh_degree(text: &str) -> Result<usize, String> {
     whole(text, 0, 3)
+}
+
+/// Parses the version of a written .spz.
+pub fn spz_version(text: &str) -> Result<SpzVersion, String> {
+    Ok(if whole(text, 3, 4)? == 3 { SpzVersion::V3 } else { SpzVersion::V4 })
 }
 
 /// Parses a number above 0.

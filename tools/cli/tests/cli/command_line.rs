@@ -43,7 +43,8 @@ fn likeness(a: &Path, b: &Path) -> f64 {
 #[test]
 fn run_reports_and_writes_what_every_command_reads() {
     let place = workplace();
-    let report = done(&call_in(place.path(), &format!("{QUICK} -o out --save ply,glb,splat,spz")));
+    let report =
+        done(&call_in(place.path(), &format!("{QUICK} -o out --save ply,glb,splat,spz,sog")));
     keys(
         &report,
         &["scene", "context", "near", "far", "input_intrinsics", "upscale", "convention"],
@@ -68,13 +69,13 @@ fn run_reports_and_writes_what_every_command_reads() {
     let written: Vec<String> = files(&out).iter().map(|p| p.to_string_lossy().into()).collect();
     let expected = "cameras.json config.json depth/view1.png depth_colour/view1.png images/view1.png \
          inputs/0.png inputs/0_depth.png inputs/1.png inputs/1_depth.png metrics.json scene.glb scene.ply \
-         scene.splat scene.spz";
+         scene.sog scene.splat scene.spz";
     assert_eq!(written, expected.split_whitespace().collect::<Vec<_>>());
     let metrics: Value =
         serde_json::from_slice(&std::fs::read(out.join("metrics.json")).unwrap()).unwrap();
     assert_eq!(metrics, report);
 
-    for format in ["ply", "glb", "splat", "spz"] {
+    for format in ["ply", "glb", "splat", "spz", "sog"] {
         let info = done(&call_in(place.path(), &format!("--json info out/scene.{format}")));
         assert_eq!(info["kind"], "splats");
         assert_eq!(info["splats"]["count"], gaussians, "{format}");

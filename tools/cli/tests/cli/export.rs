@@ -97,7 +97,7 @@ fn export_writes_every_format() {
     let place = workplace();
     save_one_splat(&place.path().join("one.ply"));
     let first = load_splats(place.path().join("one.ply")).unwrap();
-    for format in ["ply", "glb", "spz", "splat", "html"] {
+    for format in ["ply", "glb", "spz", "sog", "splat", "html"] {
         let called = call_in(place.path(), &format!("--json export one.ply -o two.{format}"));
         assert_eq!(called.code, 0, "{}", called.stderr);
         let report = called.json();
@@ -111,6 +111,10 @@ fn export_writes_every_format() {
             assert!((a - b).abs() < 1e-4, "{format}");
         }
     }
+    let called = call_in(place.path(), "export one.ply -o four.spz --spz-version 4");
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let bytes = std::fs::read(place.path().join("four.spz")).unwrap();
+    assert_eq!(bytes[..8], *b"NGSP\x04\0\0\0");
     // A view of the whole, where no cameras.json lies beside the scene.
     assert_eq!(scene_of(&place.path().join("two.html")).1["cameras"].as_array().unwrap().len(), 0);
 
@@ -213,6 +217,7 @@ fn export_refuses_what_it_cannot_write() {
         ("export one.ply -o two.ply --cameras none --gaussians 50%", "none"),
         ("export one.ply -o two.html --up y", "--up: a .html file"),
         ("export one.ply -o two.spz --up z", "y-up by definition"),
+        ("export one.ply -o two.html --spz-version 4", "--spz-version: only with a .spz"),
         ("export nothing.ply -o two.html", "nothing.ply"),
         ("export one.ply -o none/two.html", "none/two.html"),
         ("export one.ply -o two.html --min-opacity 0.95", "at least one Gaussian to write"),

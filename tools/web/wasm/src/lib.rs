@@ -76,7 +76,7 @@ pub extern "C" fn reconstruct() -> u32 {
     answer(|session, request| session.reconstruct(&request))
 }
 
-/// Writes the scene. Input: the format's extension (`ply`, `spz`, `glb` or `splat`). Answer: the
+/// Writes the scene. Input: the format's extension (`ply`, `spz`, `sog`, `glb` or `splat`). Answer: the
 /// file.
 #[unsafe(no_mangle)]
 pub extern "C" fn save() -> u32 {

@@ -163,7 +163,7 @@ impl Session {
         let scene = self.scene()?;
         let extension = String::from_utf8_lossy(extension);
         let format = SplatFormat::from_name(Path::new(&format!("scene.{extension}")))
-            .ok_or_else(|| format!("expected ply, spz, glb or splat, got {extension:?}"))?;
+            .ok_or_else(|| format!("expected ply, spz, sog, glb or splat, got {extension:?}"))?;
         let options = SaveOptions { comments: scene.comments.clone(), ..SaveOptions::default() };
         encode_splats(format, &scene.splats, &options).map_err(|e| e.to_string())
     }

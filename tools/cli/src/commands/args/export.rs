@@ -5,6 +5,7 @@ use crate::commands::values;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 use subsplat::Density;
+use subsplat::files::splats::spz::SpzVersion;
 
 /// The up direction of a written file.
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -30,12 +31,12 @@ impl From<UpArg> for subsplat::Up {
 /// Arguments of `export`.
 #[derive(Debug, Args)]
 pub struct ExportArgs {
-    /// The scene: .ply, .splat, .spz, .ksplat or .glb; or a folder that `run` wrote.
+    /// The scene: .ply, .splat, .spz, .sog, .ksplat or .glb; or a folder that `run` wrote.
     ///
-    /// A .compressed.ply is read too.
+    /// A .compressed.ply is read too, and the meta.json of a .sog in a folder.
     #[arg(value_name = "SPLATS | DIR")]
     pub scene: PathBuf,
-    /// The file to write; its extension decides the format: .html, .ply, .glb, .spz or .splat.
+    /// The file to write; its extension decides the format: .html, .ply, .glb, .spz, .sog or .splat.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
     /// Most splats (3D Gaussians), or their share: 200000, or 50%.
@@ -49,11 +50,14 @@ pub struct ExportArgs {
     /// A pose file of any kind or a scene folder. Default: cameras.json beside the scene, else the camera that the file holds, else none.
     #[arg(long, value_name = "SCENE")]
     pub cameras: Option<PathBuf>,
-    /// Up direction of a .ply or .splat (default: keep).
+    /// Up direction of a .ply, .sog or .splat (default: keep).
     ///
     /// A .glb and a .spz have +y up by their formats, and a .html is upright.
     #[arg(long, value_enum)]
     pub up: Option<UpArg>,
+    /// Version of a .spz: 4 is the newest, which fewer viewers read.
+    #[arg(long, value_name = "3 | 4", value_parser = values::spz_version, hide_short_help = true)]
+    pub spz_version: Option<SpzVersion>,
     /// Content of the scene files.
     #[command(flatten)]
     pub content: ContentArgs,

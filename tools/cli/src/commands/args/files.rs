@@ -14,6 +14,8 @@ pub enum SceneFormatArg {
     Splat,
     /// Compressed: Niantic's format, version 3.
     Spz,
+    /// Compressed for the web: PlayCanvas' format, version 2.
+    Sog,
     /// One page that shows the scene in any browser, offline too.
     Html,
 }
@@ -26,6 +28,7 @@ impl SceneFormatArg {
             Self::Glb => "scene.glb",
             Self::Splat => "scene.splat",
             Self::Spz => "scene.spz",
+            Self::Sog => "scene.sog",
             Self::Html => "scene.html",
         }
     }

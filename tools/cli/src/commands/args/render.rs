@@ -9,7 +9,7 @@ use std::path::PathBuf;
 /// Arguments of `render`.
 #[derive(Debug, Args)]
 pub struct RenderArgs {
-    /// The scene: .ply, .splat, .spz, .ksplat or .glb; or a folder that `run` wrote.
+    /// The scene: .ply, .splat, .spz, .sog, .ksplat or .glb; or a folder that `run` wrote.
     ///
     /// A .compressed.ply is read too.
     #[arg(value_name = "SPLATS | DIR")]

@@ -127,7 +127,7 @@ pub struct RenderingArgs {
     pub background: Option<[f32; 3]>,
     /// Rules by which splats are drawn.
     ///
-    /// Default: those of the network; for a scene file what `run` wrote into it (.ply, .glb), else
+    /// Default: those of the network; for a scene file what `run` wrote into it (.ply, .glb, .sog), else
     /// `standard`.
     #[arg(long, value_enum, hide_short_help = true, help_heading = PICTURES)]
     pub convention: Option<ConventionArg>,

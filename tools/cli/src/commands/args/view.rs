@@ -38,7 +38,7 @@ pub enum LevelsArg {
 pub struct ViewArgs {
     /// A finished scene, or photographs, a folder of them, or a scene with cameras.
     ///
-    /// A finished scene is a .ply, .compressed.ply, .splat, .spz, .ksplat or .glb. From
+    /// A finished scene is a .ply, .compressed.ply, .splat, .spz, .sog, .ksplat or .glb. From
     /// other input the program makes a scene first, as `run` does. Of a folder that `run` wrote, name the
     /// file: out/scene.ply.
     #[arg(required = true, num_args = 1.., value_name = "SPLATS | SCENE | IMG… | DIR")]
@@ -80,7 +80,7 @@ pub struct ViewArgs {
     pub levels: LevelsArg,
     /// Rules by which splats are drawn.
     ///
-    /// Default: those of the network; for a scene file what `run` wrote into it (.ply, .glb), else
+    /// Default: those of the network; for a scene file what `run` wrote into it (.ply, .glb, .sog), else
     /// `standard`.
     #[arg(long, value_enum, hide_short_help = true, help_heading = PICTURES)]
     pub convention: Option<ConventionArg>,

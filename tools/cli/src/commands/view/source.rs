@@ -5,14 +5,14 @@ use crate::commands::args::view::ViewArgs;
 use crate::commands::frames::DepthSpread;
 use crate::commands::memory::{self, Planned};
 use crate::commands::reconstruct::{self, reconstruct};
-use crate::commands::{info, model, pair, render, run, whole};
+use crate::commands::{model, pair, render, run, whole};
 use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
-use subsplat::files::SplatFormat;
+use subsplat::files::is_splat_file;
 use subsplat::finish::PhaseRun;
 use subsplat::scene::navigation::{Start, up_of};
 use subsplat::scene::render::{camera_of_comments, origin_of_comments};
@@ -68,7 +68,7 @@ struct Unrefined {
 /// Loads or reconstructs the scene of the arguments.
 pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     match args.input.as_slice() {
-        [one] if is_splats(one)? => finished(args, one, progress),
+        [one] if is_splat_file(one) => finished(args, one, progress),
         _ => photographs(args, progress),
     }
 }
@@ -76,19 +76,11 @@ pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
 /// Rejects flags for photographs where the scene is finished.
 pub fn check(args: &ViewArgs) -> Result<()> {
     if let ([one], Some(flag)) = (args.input.as_slice(), args.photograph_flag())
-        && is_splats(one)?
+        && is_splat_file(one)
     {
         bail!("{flag}: only with photographs; {} is a finished scene", one.display());
     }
     Ok(())
-}
-
-fn is_splats(path: &Path) -> Result<bool> {
-    if !path.is_file() {
-        return Ok(false);
-    }
-    let named = SplatFormat::from_name(path).is_some();
-    Ok(named || SplatFormat::from_magic(&info::head(path)?).is_some())
 }
 
 fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Source> {
