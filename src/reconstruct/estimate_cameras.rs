@@ -5,6 +5,7 @@ use super::{Error, Photo, Result};
 use crate::cameras::estimation::{Lens, PoseEstimate, PoseOptions, PosePhoto, estimate_poses};
 use crate::files::photos::exif::FocalSource;
 use crate::files::photos::image::LoadOptions;
+use crate::files::photos::notes::grouped;
 use crate::files::photos::photograph::{Photograph, load_photograph};
 use crate::files::poses::scene::{Scene, SceneFormat};
 use std::fmt;
@@ -160,7 +161,7 @@ fn estimate_scene(
     for (i, path) in photographs.iter().enumerate() {
         photograph(i)?;
         let loaded = load_photograph(path, &options.load)?;
-        warnings.extend(loaded.warnings.iter().cloned());
+        warnings.push(loaded.warnings.clone());
         let (lens, source) = lens(&loaded, options.lens);
         lenses.push(source);
         let Photograph { image, mask, .. } = loaded;
@@ -185,7 +186,8 @@ fn estimate_scene(
             }
         }
     }
-    scene.warnings.extend(warnings);
+    let warnings = warnings.iter().map(Vec::as_slice);
+    scene.warnings.extend(grouped(photographs.iter().copied().zip(warnings)));
     let file = |photo: usize| photographs[photo].display().to_string();
     scene.warnings.extend(estimate.left_out_sentences(file));
     scene.warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));

@@ -105,22 +105,23 @@ pub fn list_photographs(folder: impl AsRef<Path>) -> Vec<PathBuf> {
 /// Reads the header of a photograph.
 ///
 /// # Errors
-/// Those of [`super::image::probe`]; a DNG raw file.
+/// Those of [`super::image::probe`].
 pub fn probe_photograph(path: impl AsRef<Path>) -> Result<PhotographHeader> {
     let path = path.as_ref();
-    let Header { probe, exif, panorama } = decode::header(path)?;
+    let Header { probe, exif, panorama, warnings: mut notes } = decode::header(path)?;
     let orientation = probe.orientation;
     let Probe { width, height, .. } = probe.upright();
     let ExifReport { camera, warnings, .. } =
         report(exif.as_deref(), panorama, width, height, path)?;
-    Ok(PhotographHeader { width, height, orientation, camera, warnings })
+    notes.extend(warnings);
+    Ok(PhotographHeader { width, height, orientation, camera, warnings: notes })
 }
 
 /// Decodes a photograph with its mask and turns it upright. A mask file that is missing, cannot be read or has
 /// another shape gives a warning.
 ///
 /// # Errors
-/// Those of [`super::image::load_with`]; a DNG raw file; a photograph that is masked entirely.
+/// Those of [`super::image::load_with`]; a photograph that is masked entirely.
 pub fn load_photograph(path: impl AsRef<Path>, options: &LoadOptions) -> Result<Photograph> {
     let path = path.as_ref();
     decode_upright(&read(path)?, options, path, masks::of_photograph(path).as_deref())
@@ -199,13 +200,6 @@ fn report(
         ));
     }
     let mut report = block.map(|b| parse_exif(b, width, height)).unwrap_or_default();
-    if report.raw {
-        return Err(Error::format(
-            path,
-            "a developed photograph (JPEG, HEIC, PNG, TIFF)",
-            "a DNG raw file (develop it to JPEG first)",
-        ));
-    }
     if width == 2 * height && width >= PANORAMA_MIN && report.camera.focal.is_none() {
         report.warnings.push(format!(
             "{width}x{height} pixels are the shape of a panorama, which is read wrongly as a photograph: save \
