@@ -205,7 +205,7 @@ fn upright(
             Err(wrong_size(size, primary.upright))
         };
     }
-    if primary.size_tells() && size == primary.coded {
+    if primary.size_tells() && size == primary.unturned {
         return Ok(primary.turn(raster.pixels));
     }
     if size != primary.upright {
@@ -284,4 +284,167 @@ fn raw_picture<'a>(bytes: &'a [u8], path: &Path, warnings: &mut Vec<String>) -> 
     // The EXIF block belongs to the unturned pixels; its focal length holds for both.
     let exif = super::tiff_tags::is_tiff(bytes).then_some(Cow::Borrowed(bytes));
     Ok(Raster { exif, ..raster })
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::super::heif::tests::{container, file, part};
+    use super::super::photograph::{parse_photograph, probe_photograph};
+    use super::super::programs::TEST_PATH;
+    use super::super::programs::tests::folder;
+    use super::*;
+    use image::{ImageEncoder, RgbImage};
+
+    /// A PNG of `size` with a value in each pixel, and perhaps an EXIF orientation.
+    fn png(size: [u32; 2], orientation: u16) -> Vec<u8> {
+        let picture = RgbImage::from_fn(size[0], size[1], |x, y| image::Rgb([x as u8, y as u8, 7]));
+        let mut bytes = Vec::new();
+        let mut encoder = image::codecs::png::PngEncoder::new(&mut bytes);
+        let [low, high] = orientation.to_le_bytes();
+        let exif =
+            [b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(), &[low, high], &[0; 6]];
+        encoder.set_exif_metadata(exif.concat()).unwrap();
+        let kind = image::ExtendedColorType::Rgb8;
+        encoder.write_image(picture.as_raw(), size[0], size[1], kind).unwrap();
+        bytes
+    }
+
+    /// Decodes `bytes` with one program that writes `result` as `output`.
+    fn converted(
+        kind: Kind,
+        bytes: &[u8],
+        [program, output]: [&str; 2],
+        result: &[u8],
+    ) -> std::result::Result<(RgbImage, Vec<String>), String> {
+        let results = tempfile::tempdir().unwrap();
+        let at = results.path().join("result");
+        std::fs::write(&at, result).unwrap();
+        let folder = folder(&[(program, &format!("cp '{}' {output}", at.display()))]);
+        TEST_PATH.set(Some(folder.path().into()));
+        let mut warnings = Vec::new();
+        let found = decode(kind, bytes, Path::new("-photo"), &mut warnings);
+        TEST_PATH.set(None);
+        let raster = found.map_err(|e| e.to_string())?;
+        assert_eq!(raster.orientation, Orientation::NoTransforms);
+        Ok((raster.pixels.into_rgb8(), warnings))
+    }
+
+    #[test]
+    fn without_a_program_the_error_says_what_to_do() {
+        TEST_PATH.set(Some(Default::default()));
+        let bytes = file("rotated.heic");
+        let errors = [
+            decode(Kind::Heic, &bytes, Path::new("-photo"), &mut Vec::new()).err().unwrap(),
+            header(Kind::Heic, &bytes, Path::new("-photo")).err().unwrap(),
+        ];
+        TEST_PATH.set(None);
+        for e in errors.map(|e| e.to_string()) {
+            let words = ["-photo", "HEIC", "libheif-examples", "Most Compatible", "feature `heic`"];
+            assert!(words.iter().all(|word| e.contains(word)), "{e}");
+        }
+    }
+
+    #[test]
+    fn a_picture_is_turned_once_and_has_its_own_size() {
+        let rotated = file("rotated.heic");
+        let upright = |x, y| image::Rgb([x, y, 7]);
+        // Programs of libheif write upright pixels, whatever tag they leave in the result.
+        for tag in [1, 6] {
+            let program = ["heif-convert", "out.png"];
+            let (found, warnings) =
+                converted(Kind::Heic, &rotated, program, &png([48, 64], tag)).unwrap();
+            assert_eq!((found.dimensions(), found.get_pixel(0, 5)), ((48, 64), &upright(0, 5)));
+            assert_eq!(warnings, ["-photo: a HEIC picture is converted by `heif-convert`"]);
+        }
+        // The turn of the container (90 degrees clockwise), where the size tells that it is missing.
+        for program in [["ffmpeg", "out.png"], ["avifdec", "out-1.png"]] {
+            let kind = if program[0] == "ffmpeg" { Kind::Heic } else { Kind::Avif };
+            let (found, _) = converted(kind, &rotated, program, &png([64, 48], 1)).unwrap();
+            assert_eq!((found.dimensions(), found.get_pixel(0, 0)), ((48, 64), &upright(0, 47)));
+            let (found, _) = converted(kind, &rotated, program, &png([48, 64], 1)).unwrap();
+            assert_eq!(found.get_pixel(0, 0), &upright(0, 0));
+        }
+        // The tag of the result, unless it is upright already.
+        for (size, corner) in [([64, 48], [0, 47]), ([48, 64], [0, 0])] {
+            let program = ["sips", "out.tif"];
+            let (found, _) = converted(Kind::Heic, &rotated, program, &png(size, 6)).unwrap();
+            assert_eq!(
+                (found.dimensions(), found.get_pixel(0, 0)),
+                ((48, 64), &upright(corner[0], corner[1]))
+            );
+        }
+        // A half turn, which no size tells.
+        let half = container([64, 48], &[part(b"irot", &[2])]);
+        let e = converted(Kind::Heic, &half, ["ffmpeg", "out.png"], &png([64, 48], 1)).unwrap_err();
+        assert!(e.contains("ffmpeg: its rotation of this picture is uncertain"), "{e}");
+        assert!(converted(Kind::Heic, &half, ["magick", "out.png"], &png([64, 48], 1)).is_ok());
+    }
+
+    #[test]
+    fn a_tile_and_a_broken_result_are_refused() {
+        let rotated = file("rotated.heic");
+        for program in [["ffmpeg", "out.png"], ["heif-dec", "out.png"], ["sips", "out.tif"]] {
+            let e = converted(Kind::Heic, &rotated, program, &png([32, 32], 1)).unwrap_err();
+            let expected = format!("{}: it wrote 32x32 pixels of 48x64, a part of it", program[0]);
+            assert!(e.contains(&expected) && e.contains("Most Compatible"), "{e}");
+        }
+        let whole = png([48, 64], 1);
+        for result in [&b""[..], b"text", &whole[..whole.len() / 2]] {
+            let e = converted(Kind::Heic, &rotated, ["heif-dec", "out.png"], result).unwrap_err();
+            assert!(e.contains("-photo") && e.contains("heif-dec: "), "{e}");
+        }
+        // A container that states a size of a gigapixel starts no program.
+        let large = container([40_000, 40_000], &[]);
+        let e = converted(Kind::Heic, &large, ["heif-dec", "out.png"], &whole).unwrap_err();
+        assert!(e.contains("megapixels") && e.contains("40000x40000"), "{e}");
+    }
+
+    #[test]
+    fn jpeg_xl_has_the_size_of_its_start() {
+        // 16 x 16: small sides, no ratio.
+        let bytes = [0xff, 0x0a, 0b0000_0011, 0b0000_0010, 0, 0];
+        let size = jxl::upright_size(&bytes).unwrap();
+        let (found, warnings) =
+            converted(Kind::Jxl, &bytes, ["djxl", "out.png"], &png(size, 1)).unwrap();
+        assert_eq!(found.dimensions(), (size[0], size[1]));
+        assert!(warnings[0].contains("`djxl`"));
+        let e = converted(Kind::Jxl, &bytes, ["djxl", "out.png"], &png([5, 5], 1)).unwrap_err();
+        assert!(e.contains("it wrote 5x5 pixels"), "{e}");
+        assert!(converted(Kind::Jxl, &bytes[..3], ["djxl", "out.png"], b"").is_err());
+    }
+
+    #[test]
+    fn of_a_raw_file_the_jpeg_of_the_camera_is_read() {
+        let mut jpeg = Vec::new();
+        let data: Vec<u8> = (0..1700 * 20).flat_map(|i| [(i % 1700 / 7) as u8; 3]).collect();
+        let encoder = jpeg_encoder::Encoder::new(&mut jpeg, 90);
+        encoder.encode(&data, 1700, 20, jpeg_encoder::ColorType::Rgb).unwrap();
+        // Orientation 6 and DNGVersion.
+        let mut raw = b"II*\0\x08\0\0\0\x02\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0".to_vec();
+        raw.extend(b"\x12\xc6\x01\0\x04\0\0\0\x01\x04\0\0\0\0\0\0");
+        raw.extend(&jpeg);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.dng");
+        std::fs::write(&path, &raw).unwrap();
+        TEST_PATH.set(Some(Default::default()));
+        let found = parse_photograph(&raw, &LoadOptions::default(), &path);
+        let header = probe_photograph(&path);
+        // Without the JPEG, there is a program or an error.
+        let cut = parse_photograph(&raw[..60], &LoadOptions::default(), &path);
+        TEST_PATH.set(None);
+        let (found, header) = (found.unwrap(), header.unwrap());
+        assert_eq!((found.image.width, found.image.height, found.orientation), (20, 1700, Some(6)));
+        assert_eq!((header.width, header.height, header.orientation), (20, 1700, Some(6)));
+        assert!(
+            found.warnings.iter().any(|w| w.contains("own JPEG of 1700x20")),
+            "{:?}",
+            found.warnings
+        );
+        let e = cut.unwrap_err().to_string();
+        assert!(e.contains("a.dng") && e.contains("dcraw_emu"), "{e}");
+        let developed = png([30, 20], 1);
+        let program = ["dcraw_emu", "in.raw.tiff"];
+        let (found, _) = converted(Kind::Raw, &raw[..60], program, &developed).unwrap();
+        assert_eq!(found.dimensions(), (30, 20));
+    }
 }

@@ -256,19 +256,17 @@ pub(super) fn native<'a>(
 
 /// Takes a fourth band of a TIFF as its tag says. Returns the line about one that is left out.
 fn fourth_band(pixels: &mut DynamicImage, bytes: &[u8]) -> Option<&'static str> {
-    if !pixels.color().has_alpha() {
-        return None;
-    }
     match numbers(bytes, EXTRA_SAMPLES)?.first()? {
         0 => {
             let found = std::mem::take(pixels);
             *pixels = match found {
+                DynamicImage::ImageRgba8(_) => DynamicImage::ImageRgb8(found.into_rgb8()),
                 DynamicImage::ImageRgba16(_) => DynamicImage::ImageRgb16(found.into_rgb16()),
                 DynamicImage::ImageRgba32F(_) => DynamicImage::ImageRgb32F(found.into_rgb32f()),
-                _ => DynamicImage::ImageRgb8(found.into_rgb8()),
+                without => without,
             };
             Some(
-                "its fourth band is left out: the file does not say that it is an alpha (ExtraSamples is 0)",
+                "a band beside the colours is left out: the file does not say that it is an alpha (ExtraSamples is 0)",
             )
         }
         1 => {
@@ -394,4 +392,137 @@ fn to_rgb(pixels: DynamicImage) -> (Rgb, Option<Mask>) {
     let kept = || alphas().map(|alpha| alpha >= ALPHA_KEPT).collect();
     let mask = if masks { Mask::new(width, height, kept()) } else { None };
     (Rgb { width, height, data }, mask)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::files::photos::image::probe;
+    use crate::files::photos::photograph::{load_photograph, probe_photograph};
+
+    fn read_bytes(bytes: &[u8]) -> (Rgb, Vec<String>, Option<Mask>) {
+        let found = decode(bytes, &LoadOptions::default(), Path::new("a")).unwrap();
+        (found.picture, found.warnings, found.mask)
+    }
+
+    /// An RGB TIFF of 2 pixels with a fourth band of 8 bits, and perhaps its `ExtraSamples`.
+    fn four_bands(pixels: [[u8; 4]; 2], extra: Option<u16>) -> Vec<u8> {
+        let mut entries = vec![
+            [256, 3, 1, 2],
+            [257, 3, 1, 1],
+            [258, 3, 4, 0],
+            [259, 3, 1, 1],
+            [262, 3, 1, 2],
+            [273, 4, 1, 0],
+            [277, 3, 1, 4],
+            [278, 3, 1, 1],
+            [279, 4, 1, 8],
+        ];
+        entries.extend(extra.map(|value| [338, 3, 1, u32::from(value)]));
+        let behind = 8 + 2 + 12 * entries.len() as u32 + 4;
+        let mut bytes = b"II*\0\x08\0\0\0".to_vec();
+        bytes.extend((entries.len() as u16).to_le_bytes());
+        for [tag, kind, count, value] in entries {
+            let value = match tag {
+                258 => behind,
+                273 => behind + 8,
+                _ => value,
+            };
+            bytes.extend((tag as u16).to_le_bytes());
+            bytes.extend((kind as u16).to_le_bytes());
+            bytes.extend(count.to_le_bytes());
+            bytes.extend(value.to_le_bytes());
+        }
+        bytes.extend([0, 0, 0, 0, 8, 0, 8, 0, 8, 0, 8, 0]);
+        bytes.extend(pixels.as_flattened());
+        bytes
+    }
+
+    #[test]
+    fn a_fourth_band_is_an_alpha_by_its_tag() {
+        let pixels = [[100, 60, 20, 200], [100, 60, 20, 0]];
+        // Unspecified: near infrared, for example.
+        let (picture, lines, mask) = read_bytes(&four_bands(pixels, Some(0)));
+        assert_eq!((&picture.data[..], mask), (&[100, 60, 20, 100, 60, 20][..], None));
+        assert!(lines.len() == 1 && lines[0].contains("is left out: the file"), "{lines:?}");
+        for (extra, first) in
+            [(Some(2), [100, 60, 20]), (None, [100, 60, 20]), (Some(1), [127, 76, 25])]
+        {
+            let (picture, lines, mask) = read_bytes(&four_bands(pixels, extra));
+            assert_eq!(picture.data[..3], first, "{extra:?}");
+            assert_eq!(mask.unwrap().kept(), [true, false], "{extra:?}");
+            assert!(lines.len() == 1 && lines[0].contains("used as a mask"), "{lines:?}");
+        }
+    }
+
+    #[test]
+    fn the_first_picture_of_a_stereo_file_is_read() {
+        let jpeg = |size: u16, value: u8, mpf: bool| {
+            let mut bytes = Vec::new();
+            let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, 90);
+            if mpf {
+                encoder.add_app_segment(2, b"MPF\0more".to_vec()).unwrap();
+            }
+            let data = vec![value; usize::from(size) * 8 * 3];
+            encoder.encode(&data, size, 8, jpeg_encoder::ColorType::Rgb).unwrap();
+            bytes
+        };
+        let stereo = [jpeg(16, 90, true), vec![0; 40], jpeg(16, 200, false)].concat();
+        let (picture, lines, _) = read_bytes(&stereo);
+        assert_eq!((picture.width, picture.data[0].abs_diff(90) < 2), (16, true));
+        assert!(lines.len() == 1 && lines[0].contains("second picture"), "{lines:?}");
+        // A smaller one is a preview or a gain map; without the segment, what follows is not looked at.
+        for (first, second) in
+            [(jpeg(16, 90, true), jpeg(8, 1, false)), (jpeg(16, 90, false), jpeg(16, 1, false))]
+        {
+            assert!(read_bytes(&[first, second].concat()).1.is_empty());
+        }
+    }
+
+    /// A grey PNG of 1 bit, 16384 x 8192 (134 megapixels), white but for the left half of the upper half.
+    fn large_png(path: &Path) {
+        let file = File::create(path).unwrap();
+        let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), 16_384, 8192);
+        encoder.set_depth(png::BitDepth::One);
+        encoder.set_compression(png::Compression::Fastest);
+        let mut writer = encoder.write_header().unwrap();
+        let row = |y: usize| (0..2048).map(move |x| if y < 4096 && x < 1024 { 0 } else { 255 });
+        writer.write_image_data(&(0..8192).flat_map(row).collect::<Vec<u8>>()).unwrap();
+    }
+
+    #[test]
+    fn a_picture_beyond_100_megapixels_is_reduced() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("large.png");
+        large_png(&path);
+        let found = load_photograph(&path, &LoadOptions::default()).unwrap();
+        let at = |x: usize, y: usize| found.image.data[3 * (y * 8192 + x)];
+        assert_eq!((found.image.width, found.image.height), (8192, 4096));
+        assert_eq!([at(4095, 2047), at(4096, 2047), at(4095, 2048)], [0, 255, 255]);
+        let line = "16384x8192 pixels are reduced to 8192x4096 while they are read";
+        assert!(found.warnings.iter().any(|w| w.ends_with(line)), "{:?}", found.warnings);
+        let header = probe_photograph(&path).unwrap();
+        assert_eq!((header.width, header.height), (8192, 4096));
+        assert!(header.warnings.iter().any(|w| w.ends_with(line)));
+        // A header of more than a gigapixel, and a large picture without its pixels.
+        let bytes = std::fs::read(&path).unwrap();
+        let mut hostile = bytes.clone();
+        hostile[16..24].copy_from_slice(&[0, 1, 0, 0, 0, 1, 0, 0]);
+        let crc = {
+            let mut crc = flate2::Crc::new();
+            crc.update(&hostile[12..29]);
+            crc.sum()
+        };
+        hostile[29..33].copy_from_slice(&crc.to_be_bytes());
+        std::fs::write(&path, &hostile).unwrap();
+        for e in [
+            probe(&path).unwrap_err(),
+            load_photograph(&path, &LoadOptions::default()).unwrap_err(),
+        ] {
+            let e = e.to_string();
+            assert!(e.contains("1000 megapixels") && e.contains("65536x65536"), "{e}");
+        }
+        let cut = decode(&bytes[..bytes.len() / 2], &LoadOptions::default(), Path::new("a"));
+        assert!(cut.is_err());
+    }
 }

@@ -32,6 +32,8 @@ enum Step {
 pub(super) struct Primary {
     /// Size of the decoded pixels, px: the whole grid of tiles.
     pub coded: [u32; 2],
+    /// Size after the crop, px.
+    pub unturned: [u32; 2],
     /// Size after the crop, the rotation and the mirroring, px.
     pub upright: [u32; 2],
     /// ICC profile.
@@ -42,17 +44,17 @@ pub(super) struct Primary {
 }
 
 impl Primary {
-    /// Returns whether the decoded pixels are the upright ones.
+    /// Returns whether the container neither rotates nor mirrors the pixels.
     pub fn is_plain(&self) -> bool {
-        self.steps.is_empty()
+        self.steps.iter().all(|step| matches!(step, Step::Crop(_)))
     }
 
-    /// Returns whether the size of a picture tells the decoded pixels from the upright ones.
+    /// Returns whether the size of a picture tells the pixels before the rotation from the upright ones.
     pub fn size_tells(&self) -> bool {
-        self.coded != self.upright && !self.steps.iter().any(|step| matches!(step, Step::Crop(_)))
+        self.unturned != self.upright
     }
 
-    /// Turns the decoded pixels upright. The crop is not done: [`Self::size_tells`] excludes it.
+    /// Turns the pixels of [`Self::unturned`] upright.
     pub fn turn(&self, mut pixels: DynamicImage) -> DynamicImage {
         for step in &self.steps {
             // Turns of `Orientation` are clockwise.
@@ -137,13 +139,23 @@ pub(super) fn primary(bytes: &[u8]) -> Result<Primary, &'static str> {
     if found.coded.contains(&0) {
         return Err("a primary picture without a size");
     }
-    found.upright = found.coded;
-    for step in &found.steps {
+    [found.unturned, found.upright] = [found.coded; 2];
+    for (i, step) in found.steps.iter().enumerate() {
         match step {
             Step::Turn(1 | 3) => found.upright.reverse(),
-            Step::Crop(size) => found.upright = *size,
+            Step::Crop(size) => {
+                // A crop of turned pixels is read, and then no size tells.
+                found.upright = *size;
+                found.unturned = *size;
+                if i > 0 && found.steps.iter().any(|step| matches!(step, Step::Turn(1 | 3))) {
+                    found.unturned = [0; 2];
+                }
+            }
             Step::Turn(_) | Step::Mirror { .. } => {}
         }
+    }
+    if found.unturned == [0; 2] {
+        found.unturned = found.upright;
     }
     Ok(found)
 }
@@ -243,21 +255,22 @@ pub(super) fn orientation_warning(
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn file(name: &str) -> Vec<u8> {
+    /// A golden file.
+    pub fn file(name: &str) -> Vec<u8> {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/goldens/heic");
         std::fs::read(std::path::Path::new(folder).join(name)).unwrap()
     }
 
     /// A box.
-    fn part(kind: &[u8; 4], body: &[u8]) -> Vec<u8> {
+    pub fn part(kind: &[u8; 4], body: &[u8]) -> Vec<u8> {
         [&(8 + body.len() as u32).to_be_bytes()[..], kind, body].concat()
     }
 
     /// A container of one picture of `size` with further properties.
-    fn container(size: [u32; 2], more: &[Vec<u8>]) -> Vec<u8> {
+    pub fn container(size: [u32; 2], more: &[Vec<u8>]) -> Vec<u8> {
         let sides = [&[0; 4][..], &size[0].to_be_bytes(), &size[1].to_be_bytes()].concat();
         let list = [part(b"ispe", &sides), more.concat()].concat();
         let indices: Vec<u8> = (0..=more.len()).map(|i| 0x80 | (i + 1) as u8).collect();
@@ -270,21 +283,23 @@ mod tests {
 
     #[test]
     fn sizes_and_turns_are_read() {
-        for (name, coded, upright) in [
-            ("colour.heic", [64, 48], [64, 48]),
-            ("colour.avif", [64, 48], [64, 48]),
-            ("rotated.heic", [64, 48], [48, 64]),
-            ("mirrored.heic", [64, 48], [48, 64]),
+        for (name, upright) in [
+            ("colour.heic", [64, 48]),
+            ("colour.avif", [64, 48]),
+            ("rotated.heic", [48, 64]),
+            ("mirrored.heic", [48, 64]),
         ] {
             let found = primary(&file(name)).unwrap();
-            assert_eq!((found.coded, found.upright), (coded, upright), "{name}");
-            assert_eq!(found.is_plain(), coded == upright, "{name}");
+            assert_eq!((found.unturned, found.upright), ([64, 48], upright), "{name}");
+            assert_eq!(found.is_plain(), [64, 48] == upright, "{name}");
         }
         let clap: Vec<u8> =
             [30u32, 1, 20, 1, 0, 1, 0, 1].iter().flat_map(|v| v.to_be_bytes()).collect();
         let found =
             primary(&container([40, 30], &[part(b"clap", &clap), part(b"irot", &[3])])).unwrap();
-        assert_eq!((found.coded, found.upright, found.size_tells()), ([40, 30], [20, 30], false));
+        assert_eq!((found.coded, found.unturned, found.upright), ([40, 30], [30, 20], [20, 30]));
+        let crop_last = [part(b"irot", &[3]), part(b"clap", &clap)];
+        assert!(!primary(&container([40, 30], &crop_last)).unwrap().size_tells());
         let colours = part(b"colr", b"nclx\0\x0c\0\x10\0\x06\x80");
         let found = primary(&container([40, 30], &[colours, part(b"colr", b"profICC")])).unwrap();
         assert_eq!(found.coding, Some([PRIMARIES_DISPLAY_P3, 16]));

@@ -21,6 +21,8 @@ pub(super) struct Layout {
     pub progressive: bool,
     /// Bytes up to and with the end-of-image marker.
     pub end: usize,
+    /// A second start of a file stands between the segments: the first one is none.
+    pub restarted: bool,
     /// The file says that further pictures follow (an APP2 segment `MPF`, CIPA DC-007).
     pub several: bool,
     /// The file has an APP14 segment of Adobe, which says that CMYK is inverted.
@@ -48,6 +50,7 @@ pub(super) fn layout(bytes: &[u8]) -> Layout {
         lossy: false,
         progressive: false,
         end: bytes.len(),
+        restarted: false,
         several: false,
         adobe: false,
         cut_inside: None,
@@ -61,8 +64,12 @@ pub(super) fn layout(bytes: &[u8]) -> Layout {
                 layout.end = at;
                 return layout;
             }
-            // Markers without a segment: SOI, TEM and the restart markers.
-            SOI | 0x01 | 0xd0..=0xd7 => continue,
+            SOI => {
+                layout.restarted = true;
+                continue;
+            }
+            // Markers without a segment: TEM and the restart markers.
+            0x01 | 0xd0..=0xd7 => continue,
             _ => {}
         }
         let Some(length) = bytes.get(at..at + 2) else { break };

@@ -170,7 +170,18 @@ pub(super) struct Installed {
 
 /// Searches for the programs in the folders of `PATH`.
 pub(super) fn installed(kind: Kind) -> Installed {
+    #[cfg(test)]
+    if let Some(path) = TEST_PATH.with_borrow(Clone::clone) {
+        return installed_in(kind, &path);
+    }
     installed_in(kind, &std::env::var_os("PATH").unwrap_or_default())
+}
+
+#[cfg(test)]
+thread_local! {
+    /// `PATH` of the tests of a thread.
+    pub(super) static TEST_PATH: std::cell::RefCell<Option<std::ffi::OsString>> =
+        const { std::cell::RefCell::new(None) };
 }
 
 /// Searches for the programs in the folders of `path`. Relative folders are skipped: what they name depends on
@@ -282,12 +293,12 @@ fn last_line(mut messages: File) -> Option<String> {
 }
 
 #[cfg(all(test, unix))]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
 
     /// A folder with shell scripts as programs.
-    fn folder(programs: &[(&str, &str)]) -> tempfile::TempDir {
+    pub fn folder(programs: &[(&str, &str)]) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         for (name, script) in programs {
             let file = folder.path().join(name);

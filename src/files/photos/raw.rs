@@ -52,7 +52,7 @@ pub(super) fn embedded(bytes: &[u8]) -> Option<&[u8]> {
         let jpeg = &bytes[at + start..];
         let layout = jpeg::layout(jpeg);
         at += start + 3;
-        let (Some([w, h]), None) = (layout.size, layout.cut_inside) else {
+        let (Some([w, h]), None, false) = (layout.size, layout.cut_inside, layout.restarted) else {
             false_starts += 1;
             if false_starts > FALSE_STARTS {
                 break;
