@@ -193,7 +193,10 @@ pub(super) fn decode<'a>(
     path: &Path,
 ) -> Result<Decoded<'a>> {
     let mut warnings = Vec::new();
-    let raster = match kind(bytes, path)? {
+    let kind = kind(bytes, path)?;
+    // Tags of a raw file describe other pixels than those that are read.
+    let tags = if kind.is_none() { bytes } else { Default::default() };
+    let raster = match kind {
         #[cfg(feature = "heic")]
         Some(Kind::Heic) => heic::decode(bytes, path, &mut warnings)?,
         #[cfg(feature = "jxl")]
@@ -203,10 +206,10 @@ pub(super) fn decode<'a>(
     };
     let Raster { mut pixels, profile, orientation, exif, panorama } = raster;
     let mut note = |line: &str| warnings.push(format!("{}: {line}", path.display()));
-    if let Some(line) = fourth_band(&mut pixels, bytes) {
+    if let Some(line) = fourth_band(&mut pixels, tags) {
         note(line);
     }
-    if let Some(line) = ranges::to_full_range(&mut pixels, bytes) {
+    if let Some(line) = ranges::to_full_range(&mut pixels, tags) {
         note(&line);
     }
     if let Some(profile) = profile

@@ -50,9 +50,12 @@ pub(super) fn embedded(bytes: &[u8]) -> Option<&[u8]> {
     let (mut at, mut false_starts) = (0, 0);
     while let Some(start) = bytes[at..].windows(3).position(|w| w == [0xff, 0xd8, 0xff]) {
         let jpeg = &bytes[at + start..];
-        let layout = jpeg::layout(jpeg);
         at += start + 3;
-        let (Some([w, h]), None, false) = (layout.size, layout.cut_inside, layout.restarted) else {
+        // Tables, a frame header, an application's segment or a comment follow the start of a JPEG.
+        let is_start = matches!(jpeg.get(3), Some(0xc0..=0xc4 | 0xdb | 0xdd | 0xe0..=0xef | 0xfe));
+        let layout = is_start.then(|| jpeg::layout(jpeg));
+        let whole = layout.filter(|layout| layout.cut_inside.is_none() && !layout.restarted);
+        let Some((layout, [w, h])) = whole.and_then(|layout| Some((layout, layout.size?))) else {
             false_starts += 1;
             if false_starts > FALSE_STARTS {
                 break;
