@@ -202,7 +202,7 @@ pub fn photographs(
             bar.inc(1);
             let frame = &scene.frames[i];
             let mut loaded = frame.load_with(&options)?;
-            warnings.push((&frame.image, std::mem::take(&mut loaded.warnings)));
+            warnings.push((frame.image.as_path(), std::mem::take(&mut loaded.warnings)));
             Ok(Photo::from_loaded(loaded))
         };
         context.iter().map(photo).collect::<Result<_>>()
