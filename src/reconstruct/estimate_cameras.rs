@@ -6,6 +6,7 @@ use super::{Error, Photo, Result};
 use crate::cameras::estimation::{Lens, PoseEstimate, PoseOptions, PosePhoto, estimate_poses};
 use crate::files::photos::exif::FocalSource;
 use crate::files::photos::image::LoadOptions;
+use crate::files::photos::notes::grouped;
 use crate::files::photos::photograph::Photograph;
 use crate::files::poses::scene::{Scene, SceneFormat};
 use std::fmt;
@@ -169,14 +170,15 @@ fn estimate_scene(
     photograph: &mut dyn FnMut(usize) -> Result<()>,
 ) -> Result<EstimatedScene> {
     let features = features_of(photographs.len());
-    let mut warnings = Vec::new();
+    let mut said: Vec<Vec<String>> = Vec::new();
     let mut prepared = Vec::new();
     for (i, path) in photographs.iter().enumerate() {
         photograph(i)?;
         let mut one = projections::prepare(path, options, features)?;
-        warnings.append(&mut one.warnings);
+        said.push(std::mem::take(&mut one.warnings));
         prepared.push(one);
     }
+    let mut warnings = grouped(photographs.iter().copied().zip(said.iter().map(Vec::as_slice)));
     let shapes = Shapes::new(&prepared);
     let (photos, lenses): (Vec<PosePhoto>, Vec<LensSource>) =
         prepared.into_iter().map(|p| (p.photo, p.source)).unzip();

@@ -72,8 +72,13 @@ impl Photo {
     /// # Errors
     /// Those of [`Frame::load_with`].
     pub fn from_frame_with(frame: &Frame, options: &LoadOptions) -> Result<Self> {
-        let LoadedFrame { picture, mask, camera, .. } = frame.load_with(options)?;
-        Ok(Self { image: Arc::new(picture), mask: mask.map(Arc::new), camera })
+        Ok(Self::from_loaded(frame.load_with(options)?))
+    }
+
+    /// Takes over picture, mask and camera of a frame. Its warnings are the caller's matter.
+    pub fn from_loaded(frame: LoadedFrame) -> Self {
+        let LoadedFrame { picture, mask, camera, .. } = frame;
+        Self { image: Arc::new(picture), mask: mask.map(Arc::new), camera }
     }
 
     /// The same pixels with the pose of another camera; the intrinsics stay.

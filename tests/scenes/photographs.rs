@@ -178,14 +178,11 @@ fn photographs_are_upright_in_all_orientations() {
         let worst = corner.iter().zip(bottom_left).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst <= 3, "{case}: {corner:?} {bottom_left:?}");
     }
-    // A DNG file begins with a preview.
-    let e = parse_photograph(
-        &tiff_with_tag(&stored, 0xc612, 1),
-        &LoadOptions::default(),
-        file("a.dng"),
-    );
+    // A DNG file begins with a preview, which is not read in its place.
+    let preview = tiff_with_tag(&stored, 0xc612, 1);
+    let e = parse_photograph(&preview, &LoadOptions::default(), file("a.dng"));
     let e = e.unwrap_err().to_string();
-    assert!(e.contains("a.dng") && e.contains("DNG"), "{e}");
+    assert!(e.contains("a.dng") && e.contains("a raw file of a camera"), "{e}");
 }
 
 /// Writes an uncompressed little-endian TIFF with one more tag of type SHORT.
@@ -336,7 +333,6 @@ fn damaged_exif_never_panics() {
         (Tag(Context::Tiff, 0xc612), long(1)),
     ];
     let whole = block(&fields, true);
-    assert!(parse_exif(&whole, 8, 6).raw);
     for length in 0..whole.len() {
         let report = parse_exif(&whole[..length], 8, 6);
         assert!(length > 60 || !report.warnings.is_empty(), "{length}: {report:?}");
@@ -701,29 +697,34 @@ fn heic(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/heic").join(name)
 }
 
-#[test]
-fn avif_is_refused_by_name() {
-    let e = load_photograph(heic("colour.avif"), &LoadOptions::default()).unwrap_err();
-    assert!(e.to_string().contains("got an AVIF picture"), "{e}");
-    assert!(image::probe(heic("colour.avif")).unwrap_err().to_string().contains("AVIF"));
+/// Returns whether a picture that needs a program is read; where none is installed, its error names what to install.
+fn is_read(name: &str) -> bool {
+    let Err(e) = load_photograph(heic(name), &LoadOptions::default()) else { return true };
+    let e = e.to_string();
+    assert!(e.contains(name) && e.contains("which no program here converts"), "{e}");
+    assert!(e.contains("heif-convert") && e.contains("JPEG"), "{e}");
+    assert_eq!(image::probe(heic(name)).unwrap_err().to_string(), e);
+    eprintln!("SKIPPED: {name}: no program of this computer converts it");
+    false
 }
 
-#[cfg(not(feature = "heic"))]
 #[test]
-fn heic_without_the_feature_is_refused_with_advice() {
-    for e in [
-        load_photograph(&heic("colour.heic"), &LoadOptions::default()).unwrap_err(),
-        image::probe(&heic("colour.heic")).unwrap_err(),
-        image::load(&heic("rotated.heic")).unwrap_err(),
-    ] {
-        let e = e.to_string();
-        assert!(["HEIC", "heif-convert", "Most Compatible"].iter().all(|w| e.contains(w)), "{e}");
+fn avif_is_converted_by_a_program() {
+    if is_read("colour.avif") {
+        let photograph = load_photograph(heic("colour.avif"), &LoadOptions::default()).unwrap();
+        assert!(psnr(&photograph.image, &gradient(64, 48)) > 30.0);
+        let line = &photograph.warnings[0];
+        assert!(line.contains("an AVIF picture is converted by `"), "{line}");
     }
 }
 
-#[cfg(feature = "heic")]
+/// With feature `heic` by the decoder, without it by a program.
 #[test]
 fn heic_equals_the_encoded_pictures() {
+    if !is_read("colour.heic") {
+        return;
+    }
+    let lines = usize::from(cfg!(not(feature = "heic")));
     let colour = gradient(64, 48);
     let grey = |i: usize| [(30 + 3 * (i % 64) + i / 64 / 2).min(255) as u8; 3];
     let grey = Rgb { width: 64, height: 48, data: (0..64 * 48).flat_map(grey).collect() };
@@ -751,7 +752,7 @@ fn heic_equals_the_encoded_pictures() {
         let header = probe_photograph(heic(name)).unwrap();
         assert_eq!((header.width, header.height), (expected.width, expected.height), "{name}");
         assert_eq!(header.camera, photograph.camera);
-        assert!(photograph.warnings.is_empty(), "{name} {:?}", photograph.warnings);
+        assert_eq!(photograph.warnings.len(), lines, "{name} {:?}", photograph.warnings);
     }
     let camera = load_photograph(heic("rotated.heic"), &LoadOptions::default()).unwrap().camera;
     assert_eq!((camera.make.as_deref(), camera.model.as_deref()), (Some("Maker"), Some("Model 1")));
@@ -759,10 +760,9 @@ fn heic_equals_the_encoded_pictures() {
     // A file with EXIF orientation and no rotation of its own: the standard does not apply it.
     let turned = load_photograph(heic("exif_turned.heic"), &LoadOptions::default()).unwrap();
     assert_eq!((turned.image.width, turned.image.height), (64, 48));
-    assert!(turned.warnings[0].contains("EXIF orientation 6"), "{:?}", turned.warnings);
+    assert!(turned.warnings[lines].contains("EXIF orientation 6"), "{:?}", turned.warnings);
 }
 
-#[cfg(feature = "heic")]
 fn psnr(a: &Rgb, b: &Rgb) -> f64 {
     assert_eq!((a.width, a.height), (b.width, b.height));
     let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));

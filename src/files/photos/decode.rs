@@ -1,11 +1,17 @@
 //! Decoding of picture files to stored sRGB pixels, with the metadata that photographs need.
 //!
 //! Steps: detect the format by content, refuse truncated JPEG files and CMYK of unknown
-//! polarity, decode, convert an embedded ICC profile to sRGB, make a mask of an alpha channel or blend
-//! transparency with black, round to 8 bits.
+//! polarity, decode (`reduced.rs` beyond 100 megapixels, `converted.rs` what no decoder here reads), bring samples
+//! of 16 bits and of floating point to one range (`ranges.rs` has the rule), convert an embedded ICC profile to
+//! sRGB, make a mask of an alpha channel or blend transparency with black, round to 8 bits.
+//!
+//! A fourth band of a TIFF is an alpha by its `ExtraSamples`: 0 (unspecified) is none, 1 is one by which the colours are
+//! multiplied, 2 is one by which they are not. Without the tag it is read as 2, as OpenCV and others write it.
 
 use super::image::{LoadOptions, MAX_PIXELS, Probe, Truncated};
-use super::{heic, icc, jpeg};
+use super::programs::Kind;
+use super::tiff_tags::{EXTRA_SAMPLES, is_tiff, numbers};
+use super::{converted, heic, icc, jpeg, jxl, ranges, raw, reduced};
 use crate::files::{Error, Result, read};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
@@ -17,11 +23,8 @@ use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
 /// The formats, for messages.
-const FORMATS: &str = if cfg!(feature = "heic") {
-    "a PNG, JPEG, WebP, TIFF, BMP or HEIC picture"
-} else {
-    "a PNG, JPEG, WebP, TIFF or BMP picture"
-};
+pub(super) const FORMATS: &str =
+    "a picture: JPEG (also MPO), PNG, WebP, TIFF, BMP, HEIC, AVIF, JPEG XL or a camera's raw file";
 
 /// A picture file, decoded.
 pub(super) struct Decoded<'a> {
@@ -29,7 +32,7 @@ pub(super) struct Decoded<'a> {
     pub picture: Rgb,
     /// Stored pixels that the alpha channel keeps, where it masks some.
     pub mask: Option<Mask>,
-    /// EXIF orientation; `NoTransforms` for HEIC, whose decoder applies the file's rotation.
+    /// EXIF orientation; `NoTransforms` for HEIC, AVIF and JPEG XL, whose decoders apply the file's rotation.
     pub orientation: Orientation,
     /// EXIF block: a TIFF structure.
     pub exif: Option<Cow<'a, [u8]>>,
@@ -47,6 +50,33 @@ pub(super) struct Header {
     pub exif: Option<Vec<u8>>,
     /// The metadata state an equirectangular panorama.
     pub panorama: bool,
+    /// Warnings for the user, with the file's path.
+    pub warnings: Vec<String>,
+}
+
+/// Decoded pixels of any type, with the metadata of their file.
+pub(super) struct Raster<'a> {
+    pub pixels: DynamicImage,
+    /// ICC profile of the pixels.
+    pub profile: Option<Vec<u8>>,
+    pub orientation: Orientation,
+    pub exif: Option<Cow<'a, [u8]>>,
+    pub panorama: bool,
+}
+
+impl Raster<'_> {
+    /// Upright pixels without metadata.
+    pub fn of(pixels: DynamicImage) -> Self {
+        let orientation = Orientation::NoTransforms;
+        Self { pixels, profile: None, orientation, exif: None, panorama: false }
+    }
+
+    /// The same, with a copy of the EXIF block.
+    pub fn into_owned(self) -> Raster<'static> {
+        let Self { pixels, profile, orientation, exif, panorama } = self;
+        let exif = exif.map(|block| Cow::Owned(block.into_owned()));
+        Raster { pixels, profile, orientation, exif, panorama }
+    }
 }
 
 /// A decoder of the `image` crate, and the file's format.
@@ -73,13 +103,24 @@ pub(super) fn check_size(width: u32, height: u32, path: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Checks the size of a picture that can be reduced while it is read, and returns the factor.
+fn reduction(width: u32, height: u32, path: &Path) -> Result<u32> {
+    if u64::from(width) * u64::from(height) <= MAX_PIXELS {
+        return check_size(width, height, path).map(|()| 1);
+    }
+    reduced::factor(width, height).ok_or_else(|| {
+        let expected = format!("1 to {} megapixels", reduced::MAX_STORED_PIXELS / 1_000_000);
+        Error::format(path, expected, format!("{width}x{height} pixels"))
+    })
+}
+
 /// A file or its bytes. One type for both: the decoders are generic, and are then compiled once.
 pub(super) trait Input: BufRead + Seek {}
 
 impl<R: BufRead + Seek> Input for R {}
 
-/// Opens a decoder and checks the size. The content selects the decoder, not the file's
-/// extension.
+/// Opens a decoder and checks the size ([`reduced::MAX_STORED_PIXELS`]). The content selects the decoder, not the
+/// file's extension.
 pub(super) fn decoder<'a>(input: Box<dyn Input + 'a>, path: &Path) -> Result<Opened<'a>> {
     let mut reader = ImageReader::new(input);
     let mut limits = Limits::default();
@@ -92,44 +133,57 @@ pub(super) fn decoder<'a>(input: Box<dyn Input + 'a>, path: &Path) -> Result<Ope
     };
     let decoder = reader.into_decoder().map_err(|e| refused(path, e))?;
     let (w, h) = decoder.dimensions();
-    check_size(w, h, path)?;
+    reduction(w, h, path)?;
     Ok(Opened { decoder: Box::new(decoder), format })
 }
 
-/// Refuses empty files and formats that no decoder reads. Returns `true` for HEIC.
-fn is_heic(start: &[u8], path: &Path) -> Result<bool> {
-    if start.is_empty() {
+/// The kind of a picture for which `image` has no decoder; refuses empty files. `bytes` may be the start of a
+/// file, but of a TIFF.
+fn kind(bytes: &[u8], path: &Path) -> Result<Option<Kind>> {
+    if bytes.is_empty() {
         return Err(Error::format(path, FORMATS, "an empty file"));
     }
-    match heic::brand(start) {
-        Some(heic::Brand::Avif) => {
-            Err(Error::format(path, FORMATS, "an AVIF picture (convert it to JPEG or PNG first)"))
-        }
-        Some(heic::Brand::Heic) => Ok(true),
-        None => Ok(false),
-    }
+    Ok(match heic::brand(bytes) {
+        Some(heic::Brand::Avif) => Some(Kind::Avif),
+        Some(heic::Brand::Heic) => Some(Kind::Heic),
+        None if jxl::is_jxl(bytes) => Some(Kind::Jxl),
+        None => raw::is_raw(bytes, path).then_some(Kind::Raw),
+    })
 }
 
 /// Reads size, orientation and EXIF of a file without decoding its pixels.
 pub(super) fn header(path: &Path) -> Result<Header> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
     let mut reader = BufReader::new(file);
-    let heic = is_heic(reader.fill_buf().map_err(|e| Error::io(path, e))?, path)?;
-    if heic {
-        return heic::header(&read(path)?, path);
+    let start = reader.fill_buf().map_err(|e| Error::io(path, e))?;
+    // The directory of a TIFF may lie anywhere, and holds its EXIF tags.
+    let whole = if is_tiff(start) { Some(read(path)?) } else { None };
+    match kind(whole.as_deref().unwrap_or(start), path)? {
+        #[cfg(feature = "heic")]
+        Some(Kind::Heic) => return heic::header(&read(path)?, path),
+        #[cfg(feature = "jxl")]
+        Some(Kind::Jxl) => return jxl::header(&read(path)?, path),
+        Some(kind) => return converted::header(kind, &whole.map_or_else(|| read(path), Ok)?, path),
+        None => {}
     }
     let Opened { mut decoder, format } = decoder(Box::new(reader), path)?;
     let (width, height) = decoder.dimensions();
+    let factor = reduction(width, height, path)?;
+    let warnings = match factor {
+        1 => Vec::new(),
+        _ => vec![reduced::note(width, height, factor, path)],
+    };
+    let [width, height] = reduced::size(width, height, factor).map(|side| side as usize);
     // A picture with a malformed EXIF block still decodes.
     let orientation = decoder.orientation().map_or(1, Orientation::to_exif);
     let exif = match format {
-        ImageFormat::Tiff => Some(read(path)?),
+        ImageFormat::Tiff => whole,
         _ => decoder.exif_metadata().ok().flatten(),
     };
     let orientation = (orientation > 1).then_some(orientation);
-    let probe = Probe { width: width as usize, height: height as usize, orientation };
+    let probe = Probe { width, height, orientation };
     let panorama = is_panorama(&mut *decoder);
-    Ok(Header { probe, exif, panorama })
+    Ok(Header { probe, exif, panorama, warnings })
 }
 
 /// Decodes the bytes of a picture file; `path` is for messages.
@@ -139,39 +193,119 @@ pub(super) fn decode<'a>(
     path: &Path,
 ) -> Result<Decoded<'a>> {
     let mut warnings = Vec::new();
-    let heic = is_heic(bytes, path)?;
-    let mut panorama = false;
-    let (mut pixels, profile, orientation, exif) = if heic {
-        let heic::Pixels { pixels, profile, exif } = heic::decode(bytes, path, &mut warnings)?;
-        (pixels, profile, Orientation::NoTransforms, exif.map(Cow::Owned))
-    } else {
-        if jpeg::is_jpeg(bytes) {
-            check_jpeg(bytes, options, path, &mut warnings)?;
-        }
-        let Opened { mut decoder, format } = decoder(Box::new(Cursor::new(bytes)), path)?;
-        let profile = decoder.icc_profile().unwrap_or_else(|e| {
-            warnings.push(format!("{}: the ICC profile is ignored: {e}", path.display()));
-            None
-        });
-        let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-        let exif = match format {
-            ImageFormat::Tiff => Some(Cow::Borrowed(bytes)),
-            _ => decoder.exif_metadata().ok().flatten().map(Cow::Owned),
-        };
-        panorama = is_panorama(&mut *decoder);
-        let pixels = DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?;
-        (pixels, profile, orientation, exif)
+    let kind = kind(bytes, path)?;
+    // Tags of a raw file describe other pixels than those that are read.
+    let tags = if kind.is_none() { bytes } else { Default::default() };
+    let raster = match kind {
+        #[cfg(feature = "heic")]
+        Some(Kind::Heic) => heic::decode(bytes, path, &mut warnings)?,
+        #[cfg(feature = "jxl")]
+        Some(Kind::Jxl) => jxl::decode(bytes, path)?,
+        Some(kind) => converted::decode(kind, bytes, path, &mut warnings)?,
+        None => native(bytes, options, path, &mut warnings)?,
     };
+    let Raster { mut pixels, profile, orientation, exif, panorama } = raster;
+    let mut note = |line: &str| warnings.push(format!("{}: {line}", path.display()));
+    if let Some(line) = fourth_band(&mut pixels, tags) {
+        note(line);
+    }
+    if let Some(line) = ranges::to_full_range(&mut pixels, tags) {
+        note(&line);
+    }
     if let Some(profile) = profile
         && let Err(reason) = icc::to_srgb(&mut pixels, &profile)
     {
-        warnings.push(format!(
-            "{}: the ICC profile is ignored and the colours are read as sRGB: {reason}",
-            path.display()
-        ));
+        note(&format!("the ICC profile is ignored and the colours are read as sRGB: {reason}"));
     }
     let (picture, mask) = to_rgb(pixels);
+    if mask.is_some() {
+        note("the alpha channel is used as a mask: pixels with an alpha below 128 are left out");
+    }
     Ok(Decoded { picture, mask, orientation, exif, panorama, warnings })
+}
+
+/// Decodes a format of the `image` crate.
+pub(super) fn native<'a>(
+    bytes: &'a [u8],
+    options: &LoadOptions,
+    path: &Path,
+    warnings: &mut Vec<String>,
+) -> Result<Raster<'a>> {
+    if jpeg::is_jpeg(bytes) {
+        check_jpeg(bytes, options, path, warnings)?;
+    }
+    let Opened { mut decoder, format } = decoder(Box::new(Cursor::new(bytes)), path)?;
+    let profile = decoder.icc_profile().unwrap_or_else(|e| {
+        warnings.push(format!("{}: the ICC profile is ignored: {e}", path.display()));
+        None
+    });
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let exif = match format {
+        ImageFormat::Tiff => Some(Cow::Borrowed(bytes)),
+        _ => decoder.exif_metadata().ok().flatten().map(Cow::Owned),
+    };
+    let panorama = is_panorama(&mut *decoder);
+    let (width, height) = decoder.dimensions();
+    let pixels = match reduction(width, height, path)? {
+        1 => DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?,
+        factor => {
+            drop(decoder);
+            warnings.push(reduced::note(width, height, factor, path));
+            reduced::decode(bytes, format, factor, path)?
+        }
+    };
+    Ok(Raster { pixels, profile, orientation, exif, panorama })
+}
+
+/// Takes a fourth band of a TIFF as its tag says. Returns the line about one that is left out.
+fn fourth_band(pixels: &mut DynamicImage, bytes: &[u8]) -> Option<&'static str> {
+    match numbers(bytes, EXTRA_SAMPLES)?.first()? {
+        0 => {
+            let found = std::mem::take(pixels);
+            *pixels = match found {
+                DynamicImage::ImageRgba8(_) => DynamicImage::ImageRgb8(found.into_rgb8()),
+                DynamicImage::ImageRgba16(_) => DynamicImage::ImageRgb16(found.into_rgb16()),
+                DynamicImage::ImageRgba32F(_) => DynamicImage::ImageRgb32F(found.into_rgb32f()),
+                without => without,
+            };
+            Some(
+                "a band beside the colours is left out: the file does not say that it is an alpha (ExtraSamples is 0)",
+            )
+        }
+        1 => {
+            divide_by_alpha(pixels);
+            None
+        }
+        _ => None,
+    }
+}
+
+/// Undoes the multiplication of the colours by their alpha. Colours without opacity stay.
+fn divide_by_alpha(pixels: &mut DynamicImage) {
+    match pixels {
+        DynamicImage::ImageRgba8(pixels) => {
+            for pixel in pixels.pixels_mut().filter(|p| p.0[3] > 0) {
+                let [colors @ .., alpha] = &mut pixel.0;
+                let divided = |v: u8| (u32::from(v) * 255 / u32::from(*alpha)).min(255) as u8;
+                colors.iter_mut().for_each(|v| *v = divided(*v));
+            }
+        }
+        DynamicImage::ImageRgba16(pixels) => {
+            for pixel in pixels.pixels_mut().filter(|p| p.0[3] > 0) {
+                let [colors @ .., alpha] = &mut pixel.0;
+                let divided =
+                    |v: u16| (u64::from(v) * 65_535 / u64::from(*alpha)).min(65_535) as u16;
+                colors.iter_mut().for_each(|v| *v = divided(*v));
+            }
+        }
+        DynamicImage::ImageRgba32F(pixels) => {
+            for pixel in pixels.pixels_mut().filter(|p| p.0[3] > 0.0) {
+                let [colors @ .., alpha] = &mut pixel.0;
+                colors.iter_mut().for_each(|v| *v /= *alpha);
+            }
+        }
+        _ => {}
+    }
 }
 
 /// Returns whether the XMP block states an equirectangular panorama: GPano's `ProjectionType`, which cameras,
@@ -191,6 +325,12 @@ fn check_jpeg(
     warnings: &mut Vec<String>,
 ) -> Result<()> {
     let layout = jpeg::layout(bytes);
+    if layout.several && jpeg::second_of_size(bytes, &layout) {
+        warnings.push(format!(
+            "{}: the file has a second picture of the same size (MPO, stereo): the first one is read",
+            path.display()
+        ));
+    }
     if let Some(part) = layout.cut_inside {
         match options.truncated {
             Truncated::Refuse => {
@@ -255,4 +395,137 @@ fn to_rgb(pixels: DynamicImage) -> (Rgb, Option<Mask>) {
     let kept = || alphas().map(|alpha| alpha >= ALPHA_KEPT).collect();
     let mask = if masks { Mask::new(width, height, kept()) } else { None };
     (Rgb { width, height, data }, mask)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::files::photos::image::probe;
+    use crate::files::photos::photograph::{load_photograph, probe_photograph};
+
+    fn read_bytes(bytes: &[u8]) -> (Rgb, Vec<String>, Option<Mask>) {
+        let found = decode(bytes, &LoadOptions::default(), Path::new("a")).unwrap();
+        (found.picture, found.warnings, found.mask)
+    }
+
+    /// An RGB TIFF of 2 pixels with a fourth band of 8 bits, and perhaps its `ExtraSamples`.
+    fn four_bands(pixels: [[u8; 4]; 2], extra: Option<u16>) -> Vec<u8> {
+        let mut entries = vec![
+            [256, 3, 1, 2],
+            [257, 3, 1, 1],
+            [258, 3, 4, 0],
+            [259, 3, 1, 1],
+            [262, 3, 1, 2],
+            [273, 4, 1, 0],
+            [277, 3, 1, 4],
+            [278, 3, 1, 1],
+            [279, 4, 1, 8],
+        ];
+        entries.extend(extra.map(|value| [338, 3, 1, u32::from(value)]));
+        let behind = 8 + 2 + 12 * entries.len() as u32 + 4;
+        let mut bytes = b"II*\0\x08\0\0\0".to_vec();
+        bytes.extend((entries.len() as u16).to_le_bytes());
+        for [tag, kind, count, value] in entries {
+            let value = match tag {
+                258 => behind,
+                273 => behind + 8,
+                _ => value,
+            };
+            bytes.extend((tag as u16).to_le_bytes());
+            bytes.extend((kind as u16).to_le_bytes());
+            bytes.extend(count.to_le_bytes());
+            bytes.extend(value.to_le_bytes());
+        }
+        bytes.extend([0, 0, 0, 0, 8, 0, 8, 0, 8, 0, 8, 0]);
+        bytes.extend(pixels.as_flattened());
+        bytes
+    }
+
+    #[test]
+    fn a_fourth_band_is_an_alpha_by_its_tag() {
+        let pixels = [[100, 60, 20, 200], [100, 60, 20, 0]];
+        // Unspecified: near infrared, for example.
+        let (picture, lines, mask) = read_bytes(&four_bands(pixels, Some(0)));
+        assert_eq!((&picture.data[..], mask), (&[100, 60, 20, 100, 60, 20][..], None));
+        assert!(lines.len() == 1 && lines[0].contains("is left out: the file"), "{lines:?}");
+        for (extra, first) in
+            [(Some(2), [100, 60, 20]), (None, [100, 60, 20]), (Some(1), [127, 76, 25])]
+        {
+            let (picture, lines, mask) = read_bytes(&four_bands(pixels, extra));
+            assert_eq!(picture.data[..3], first, "{extra:?}");
+            assert_eq!(mask.unwrap().kept(), [true, false], "{extra:?}");
+            assert!(lines.len() == 1 && lines[0].contains("used as a mask"), "{lines:?}");
+        }
+    }
+
+    #[test]
+    fn the_first_picture_of_a_stereo_file_is_read() {
+        let jpeg = |size: u16, value: u8, mpf: bool| {
+            let mut bytes = Vec::new();
+            let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, 90);
+            if mpf {
+                encoder.add_app_segment(2, b"MPF\0more".to_vec()).unwrap();
+            }
+            let data = vec![value; usize::from(size) * 8 * 3];
+            encoder.encode(&data, size, 8, jpeg_encoder::ColorType::Rgb).unwrap();
+            bytes
+        };
+        let stereo = [jpeg(16, 90, true), vec![0; 40], jpeg(16, 200, false)].concat();
+        let (picture, lines, _) = read_bytes(&stereo);
+        assert_eq!((picture.width, picture.data[0].abs_diff(90) < 2), (16, true));
+        assert!(lines.len() == 1 && lines[0].contains("second picture"), "{lines:?}");
+        // A smaller one is a preview or a gain map; without the segment, what follows is not looked at.
+        for (first, second) in
+            [(jpeg(16, 90, true), jpeg(8, 1, false)), (jpeg(16, 90, false), jpeg(16, 1, false))]
+        {
+            assert!(read_bytes(&[first, second].concat()).1.is_empty());
+        }
+    }
+
+    /// A grey PNG of 1 bit, 16384 x 8192 (134 megapixels), white but for the left half of the upper half.
+    fn large_png(path: &Path) {
+        let file = File::create(path).unwrap();
+        let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), 16_384, 8192);
+        encoder.set_depth(png::BitDepth::One);
+        encoder.set_compression(png::Compression::Fastest);
+        let mut writer = encoder.write_header().unwrap();
+        let row = |y: usize| (0..2048).map(move |x| if y < 4096 && x < 1024 { 0 } else { 255 });
+        writer.write_image_data(&(0..8192).flat_map(row).collect::<Vec<u8>>()).unwrap();
+    }
+
+    #[test]
+    fn a_picture_beyond_100_megapixels_is_reduced() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("large.png");
+        large_png(&path);
+        let found = load_photograph(&path, &LoadOptions::default()).unwrap();
+        let at = |x: usize, y: usize| found.image.data[3 * (y * 8192 + x)];
+        assert_eq!((found.image.width, found.image.height), (8192, 4096));
+        assert_eq!([at(4095, 2047), at(4096, 2047), at(4095, 2048)], [0, 255, 255]);
+        let line = "16384x8192 pixels are reduced to 8192x4096 while they are read";
+        assert!(found.warnings.iter().any(|w| w.ends_with(line)), "{:?}", found.warnings);
+        let header = probe_photograph(&path).unwrap();
+        assert_eq!((header.width, header.height), (8192, 4096));
+        assert!(header.warnings.iter().any(|w| w.ends_with(line)));
+        // A header of more than a gigapixel, and a large picture without its pixels.
+        let bytes = std::fs::read(&path).unwrap();
+        let mut hostile = bytes.clone();
+        hostile[16..24].copy_from_slice(&[0, 1, 0, 0, 0, 1, 0, 0]);
+        let crc = {
+            let mut crc = flate2::Crc::new();
+            crc.update(&hostile[12..29]);
+            crc.sum()
+        };
+        hostile[29..33].copy_from_slice(&crc.to_be_bytes());
+        std::fs::write(&path, &hostile).unwrap();
+        for e in [
+            probe(&path).unwrap_err(),
+            load_photograph(&path, &LoadOptions::default()).unwrap_err(),
+        ] {
+            let e = e.to_string();
+            assert!(e.contains("1000 megapixels") && e.contains("65536x65536"), "{e}");
+        }
+        let cut = decode(&bytes[..bytes.len() / 2], &LoadOptions::default(), Path::new("a"));
+        assert!(cut.is_err());
+    }
 }

@@ -93,8 +93,6 @@ pub struct ExifCamera {
 pub struct ExifReport {
     /// The camera.
     pub camera: ExifCamera,
-    /// The block has DNG's version tag: the file is a raw file, and its first picture a preview.
-    pub raw: bool,
     /// Ignored values, one line each with tag and value.
     pub warnings: Vec<String>,
 }
@@ -118,8 +116,6 @@ pub fn parse_exif(block: &[u8], width: usize, height: usize) -> ExifReport {
             return report;
         }
     };
-    // DNGVersion has no name in `kamadak-exif`.
-    report.raw = tags.exif.get_field(Tag(exif::Context::Tiff, 0xc612), In::PRIMARY).is_some();
     report.camera.make = tags.text(Tag::Make);
     report.camera.model = tags.text(Tag::Model);
     let stored = tags.stored_size(width, height, &mut report.warnings);

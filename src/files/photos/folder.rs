@@ -1,20 +1,21 @@
 //! The photographs of a folder, by content: a picture under another extension is one, and what cannot be
 //! read is named with the reason.
 
-use super::heic;
 use super::photograph::probe_photograph;
+use super::{heic, jxl, raw};
 use crate::files::Error;
 use crate::files::poses::assemble::{files, has_extension};
+use std::collections::HashSet;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Extensions of pictures beside the usual ones; some of the formats are not read.
-const OTHER_EXTENSIONS: [&str; 15] = [
-    "avif", "jxl", "gif", "exr", "hdr", "dng", "cr2", "cr3", "nef", "arw", "raf", "orf", "rw2",
-    "mpo", "insp",
-];
+/// Extensions of pictures beside the usual ones and the raw ones; some of the formats are not read.
+const OTHER_EXTENSIONS: [&str; 6] = ["gif", "exr", "hdr", "cr3", "raf", "insp"];
 /// Extensions of videos.
 const VIDEOS: [&str; 6] = ["mov", "mp4", "m4v", "avi", "mkv", "webm"];
+/// Extensions of pictures that every program reads. Cameras and phones write another format beside one of them, and
+/// people convert to them: a file of the same name is the same photograph.
+const COMMON_EXTENSIONS: [&str; 7] = ["jpg", "jpeg", "jpe", "jfif", "png", "tif", "tiff"];
 /// Names of a line; the others are counted.
 const NAMES: usize = 3;
 /// Bytes that decide what a file is.
@@ -87,7 +88,37 @@ fn in_folder(folder: &Path) -> FolderPhotographs {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         found.left_out.push([name, reason]);
     }
+    leave_out_twins(&mut found);
     found
+}
+
+/// Leaves out raw, HEIC, AVIF and JPEG XL files beside a JPEG, PNG or TIFF of the same name: two photographs from one
+/// place.
+fn leave_out_twins(found: &mut FolderPhotographs) {
+    let lower =
+        |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().to_lowercase();
+    let is_common = |path: &Path| COMMON_EXTENSIONS.contains(&lower(path.extension()).as_str());
+    let stem = |path: &Path| lower(path.file_stem());
+    let common: HashSet<String> =
+        found.photographs.iter().filter(|path| is_common(path)).map(|path| stem(path)).collect();
+    let left_out = &mut found.left_out;
+    found.photographs.retain(|path| {
+        // Only formats of cameras and phones, not every other extension.
+        let is_twin =
+            !is_common(path) && has_format_of_its_own(path) && common.contains(&stem(path));
+        if is_twin {
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            left_out.push([name, "a JPEG, PNG or TIFF of the same name is read".to_owned()]);
+        }
+        !is_twin
+    });
+}
+
+/// Returns whether an extension is one of HEIC, AVIF, JPEG XL or a raw format.
+fn has_format_of_its_own(path: &Path) -> bool {
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    ["heic", "heif", "hif", "avif", "jxl", "cr3", "raf"].contains(&extension.as_str())
+        || raw::EXTENSIONS.contains(&extension.as_str())
 }
 
 /// Returns whether a file is, or is called, a picture or a video.
@@ -95,6 +126,7 @@ fn is_picture(path: &Path) -> bool {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     if has_extension(path)
         || OTHER_EXTENSIONS.contains(&&*extension)
+        || raw::EXTENSIONS.contains(&&*extension)
         || VIDEOS.contains(&&*extension)
     {
         return true;
@@ -102,7 +134,11 @@ fn is_picture(path: &Path) -> bool {
     let mut start = Vec::with_capacity(START);
     let read =
         std::fs::File::open(path).and_then(|file| file.take(START as u64).read_to_end(&mut start));
-    read.is_ok() && (image::guess_format(&start).is_ok() || heic::brand(&start).is_some())
+    read.is_ok()
+        && (image::guess_format(&start).is_ok()
+            || heic::brand(&start).is_some()
+            || jxl::is_jxl(&start)
+            || raw::is_raw(&start, path))
 }
 
 /// Number of files `._*`.

@@ -1,13 +1,9 @@
-//! HEIC pictures (HEVC in the HEIF container), through `heic-rs` with feature `heic`.
+//! HEIC pictures (HEVC in the HEIF container), through `heic-rs` with feature `heic`; without it a program converts
+//! them (`converted.rs`).
 //!
 //! The decoder applies the container's crop, rotation and mirroring (`clap`, `irot`, `imir`).
 //! The EXIF orientation of a HEIC file repeats them and is not applied (ISO/IEC 23008-12,
 //! 6.5.10). "Stored pixels" of a HEIC file are therefore its upright pixels.
-
-use super::decode::Header;
-use crate::files::{Error, Result};
-use image::DynamicImage;
-use std::path::Path;
 
 /// Kind of a HEIF container.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -16,15 +12,6 @@ pub(super) enum Brand {
     Heic,
     /// AV1.
     Avif,
-}
-
-/// Pixels and metadata of a HEIC file.
-pub(super) struct Pixels {
-    pub pixels: DynamicImage,
-    /// ICC profile.
-    pub profile: Option<Vec<u8>>,
-    /// EXIF block: a TIFF structure.
-    pub exif: Option<Vec<u8>>,
 }
 
 /// Reads the brands of the `ftyp` box at the start of a file; `None` for other containers.
@@ -44,48 +31,22 @@ pub(super) fn brand(start: &[u8]) -> Option<Brand> {
     brands.any(|b| HEVC.contains(&b) || b == b"mif1" || b == b"msf1").then_some(Brand::Heic)
 }
 
-#[cfg(not(feature = "heic"))]
-fn unsupported(path: &Path) -> Error {
-    Error::format(
-        path,
-        "a PNG, JPEG, WebP, TIFF or BMP picture",
-        "a HEIC picture, which this build does not read (convert it: `heif-convert photo.heic \
-         photo.jpg`; on an iPhone: Settings > Camera > Formats > Most Compatible; or build with \
-         the feature `heic`)",
-    )
-}
-
-/// Reads size and EXIF without decoding the pixels.
-#[cfg(not(feature = "heic"))]
-pub(super) fn header(_: &[u8], path: &Path) -> Result<Header> {
-    Err(unsupported(path))
-}
-
-/// Decodes the primary picture.
-#[cfg(not(feature = "heic"))]
-pub(super) fn decode(_: &[u8], path: &Path, _: &mut Vec<String>) -> Result<Pixels> {
-    Err(unsupported(path))
-}
-
 #[cfg(feature = "heic")]
 pub(super) use supported::{decode, header};
 
 #[cfg(feature = "heic")]
 mod supported {
-    use super::super::decode::check_size;
+    use super::super::decode::{Header, Raster, check_size};
+    use super::super::heif::{PRIMARIES_DISPLAY_P3, display_p3, hdr_warning, orientation_warning};
     use super::super::image::{MAX_PIXELS, Probe};
-    use super::{DynamicImage, Error, Header, Path, Pixels, Result};
+    use crate::files::{Error, Result};
     use heic_rs::context::Context;
     use heic_rs::hevc::{self, Frame};
     use heic_rs::{MatrixCoefficients, Mirror, Nclx, PixelLayout, Range, Transform};
-    use image::ImageBuffer;
-    use image::metadata::Orientation;
+    use image::{DynamicImage, ImageBuffer};
     use rayon::prelude::*;
-
-    /// Codes of ITU-T H.273.
-    const PRIMARIES_DISPLAY_P3: u16 = 12;
-    const TRANSFER_PQ: u16 = 16;
-    const TRANSFER_HLG: u16 = 18;
+    use std::borrow::Cow;
+    use std::path::Path;
 
     fn refused(path: &Path, error: &heic_rs::Error) -> Error {
         Error::format(path, "a HEIC picture", error.to_string())
@@ -98,7 +59,7 @@ mod supported {
         let (width, height) = (info.width as usize, info.height as usize);
         let probe = Probe { width, height, orientation: None };
         let context = Context::open(bytes).map_err(|e| refused(path, &e))?;
-        Ok(Header { probe, exif: exif(&context), panorama: false })
+        Ok(Header { probe, exif: exif(&context), panorama: false, warnings: Vec::new() })
     }
 
     /// A picture with a malformed EXIF block still decodes.
@@ -155,7 +116,7 @@ mod supported {
     }
 
     /// Decodes the primary picture.
-    pub fn decode(bytes: &[u8], path: &Path, warnings: &mut Vec<String>) -> Result<Pixels> {
+    pub fn decode<'a>(bytes: &[u8], path: &Path, warnings: &mut Vec<String>) -> Result<Raster<'a>> {
         let refused = |e: heic_rs::Error| refused(path, &e);
         let info = heic_rs::probe(bytes).map_err(refused)?;
         check_size(info.width, info.height, path)?;
@@ -185,35 +146,16 @@ mod supported {
         if info.has_alpha {
             warnings.push(format!("{}: the transparency is ignored", path.display()));
         }
-        if let Some(nclx) = properties.nclx
-            && [TRANSFER_PQ, TRANSFER_HLG].contains(&nclx.transfer)
-        {
-            warnings.push(format!(
-                "{}: the picture is HDR (transfer characteristics {}) and is read as if it were \
-                 SDR: its tones are wrong",
-                path.display(),
-                nclx.transfer
-            ));
+        if let Some(nclx) = properties.nclx {
+            warnings.extend(hdr_warning(nclx.transfer, path));
         }
-        let untransformed = info.rotation == heic_rs::Rotation::None && info.mirror.is_none();
-        let orientation = exif.as_deref().and_then(Orientation::from_exif_chunk);
-        if let Some(orientation) = orientation
-            && untransformed
-            && orientation != Orientation::NoTransforms
-        {
-            warnings.push(format!(
-                "{}: EXIF orientation {} is ignored: HEIC keeps its rotation outside EXIF, and \
-                 the file has none there",
-                path.display(),
-                orientation.to_exif()
-            ));
-        }
-        let p3 = || moxcms::ColorProfile::new_display_p3().encode().ok();
+        let is_plain = info.rotation == heic_rs::Rotation::None && info.mirror.is_none();
+        warnings.extend(orientation_warning(exif.as_deref(), is_plain, path));
         let profile = match (properties.icc, properties.nclx) {
             (Some(icc), _) => Some(icc.to_vec()),
-            (None, Some(nclx)) if nclx.primaries == PRIMARIES_DISPLAY_P3 => p3(),
+            (None, Some(nclx)) if nclx.primaries == PRIMARIES_DISPLAY_P3 => display_p3(),
             _ => None,
         };
-        Ok(Pixels { pixels, profile, exif })
+        Ok(Raster { profile, exif: exif.map(Cow::Owned), ..Raster::of(pixels) })
     }
 }

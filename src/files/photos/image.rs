@@ -1,5 +1,5 @@
-//! Reading of pictures (PNG, JPEG, WebP, TIFF, BMP; HEIC with feature `heic`), and writing
-//! (8-bit PNG, 16-bit depth PNG).
+//! Reading of pictures (PNG, JPEG, WebP, TIFF, BMP; HEIC with feature `heic`, JPEG XL with feature `jxl`; these, AVIF
+//! and raw files through programs of the computer), and writing (8-bit PNG, 16-bit depth PNG).
 //!
 //! In memory a picture is 8-bit sRGB, rows from the top, because the evaluation protocol
 //! resizes uint8 (MVSplat, with PIL). The network reads `[3, H, W]` floats in [0, 1]. A
@@ -12,18 +12,20 @@ use super::decode::{self, decode, decoder};
 use crate::files::{Error, Result, read, write_atomic};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::{Depth, Rgb};
+use image::ImageDecoder;
 use std::io::Write;
 use std::path::Path;
 
-/// Largest number of pixels of a picture; checked before anything is allocated.
+/// Largest number of pixels of a picture in memory; checked before anything is allocated. A JPEG, PNG or TIFF of up to 10
+/// times as many is reduced by 2, 4 or 8 along both axes while it is read.
 pub const MAX_PIXELS: u64 = 100_000_000;
 
 /// Fields of a picture's header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Probe {
-    /// Stored width, px.
+    /// Stored width, px; of a picture beyond [`MAX_PIXELS`] the reduced width.
     pub width: usize,
-    /// Stored height, px.
+    /// Stored height, px; of a picture beyond [`MAX_PIXELS`] the reduced height.
     pub height: usize,
     /// EXIF orientation 2 to 8; `None` for "as stored".
     pub orientation: Option<u8>,
@@ -74,7 +76,8 @@ pub struct LoadedPicture {
 /// Reads size and orientation from the header.
 ///
 /// # Errors
-/// Missing, not a picture, more than [`MAX_PIXELS`].
+/// Missing, not a picture, too large ([`MAX_PIXELS`]); a format that neither this build nor a program of the
+/// computer reads.
 pub fn probe(path: impl AsRef<Path>) -> Result<Probe> {
     Ok(decode::header(path.as_ref())?.probe)
 }
@@ -85,8 +88,8 @@ pub fn probe(path: impl AsRef<Path>) -> Result<Probe> {
 /// are applied as well.
 ///
 /// # Errors
-/// Missing, truncated, not a picture, more than [`MAX_PIXELS`]; CMYK without Adobe's marker;
-/// HEIC without feature `heic`.
+/// Missing, truncated, not a picture, too large ([`MAX_PIXELS`]); CMYK without Adobe's marker; a format that neither
+/// this build nor a program of the computer reads.
 pub fn load(path: impl AsRef<Path>) -> Result<Rgb> {
     Ok(load_with(path, &LoadOptions::default())?.picture)
 }
@@ -246,6 +249,8 @@ pub fn parse_depth_png(bytes: &[u8], unit: f32, path: impl AsRef<Path>) -> Resul
 
 fn decode_depth_png(bytes: &[u8], unit: f32, path: &Path) -> Result<Depth> {
     let decoder = decoder(Box::new(std::io::Cursor::new(bytes)), path)?.decoder;
+    let (width, height) = decoder.dimensions();
+    decode::check_size(width, height, path)?;
     let decoded =
         image::DynamicImage::from_decoder(decoder).map_err(|e| decode::refused(path, e))?;
     let image::DynamicImage::ImageLuma16(grey) = decoded else {

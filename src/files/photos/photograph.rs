@@ -107,27 +107,27 @@ pub fn list_photographs(folder: impl AsRef<Path>) -> Vec<PathBuf> {
 /// Reads the header of a photograph.
 ///
 /// # Errors
-/// Those of [`super::image::probe`]; a DNG raw file.
+/// Those of [`super::image::probe`].
 pub fn probe_photograph(path: impl AsRef<Path>) -> Result<PhotographHeader> {
     let path = path.as_ref();
-    let Header { probe, exif, panorama } = decode::header(path)?;
+    let Header { probe, exif, panorama, warnings: mut notes } = decode::header(path)?;
     let orientation = probe.orientation;
     let Probe { width, height, .. } = probe.upright();
-    let ExifReport { mut camera, mut warnings, .. } = report(exif.as_deref(), width, height, path)?;
+    let ExifReport { mut camera, warnings, .. } = report(exif.as_deref(), width, height, path);
+    notes.extend(warnings);
     if panorama {
         camera.focal = None;
     } else {
-        warnings.extend(panorama_shape(&camera, width, height, path));
+        notes.extend(panorama_shape(&camera, width, height, path));
     }
-    Ok(PhotographHeader { width, height, orientation, camera, panorama, warnings })
+    Ok(PhotographHeader { width, height, orientation, camera, panorama, warnings: notes })
 }
 
 /// Decodes a photograph with its mask and turns it upright. A mask file that is missing, cannot be read or has
 /// another shape gives a warning.
 ///
 /// # Errors
-/// Those of [`super::image::load_with`]; a DNG raw file; a photograph that is masked entirely; a panorama, by
-/// its metadata.
+/// Those of [`super::image::load_with`]; a photograph that is masked entirely; a panorama, by its metadata.
 pub fn load_photograph(path: impl AsRef<Path>, options: &LoadOptions) -> Result<Photograph> {
     let path = path.as_ref();
     let mask = masks::of_photograph(path);
@@ -191,7 +191,7 @@ fn decode_upright(
 ) -> Result<PhotographOrPanorama> {
     let decoded = decode(bytes, options, path)?;
     let Rgb { width, height, .. } = decoded.picture;
-    let mut report = report(decoded.exif.as_deref(), width, height, path)?;
+    let mut report = report(decoded.exif.as_deref(), width, height, path);
     if decoded.panorama {
         report.camera.focal = None;
     }
@@ -248,17 +248,10 @@ pub(crate) fn panorama_shape(
 }
 
 /// Reads the EXIF block and adds the path to its warnings.
-fn report(block: Option<&[u8]>, width: usize, height: usize, path: &Path) -> Result<ExifReport> {
+fn report(block: Option<&[u8]>, width: usize, height: usize, path: &Path) -> ExifReport {
     let mut report = block.map(|b| parse_exif(b, width, height)).unwrap_or_default();
-    if report.raw {
-        return Err(Error::format(
-            path,
-            "a developed photograph (JPEG, HEIC, PNG, TIFF)",
-            "a DNG raw file (develop it to JPEG first)",
-        ));
-    }
     for warning in &mut report.warnings {
         *warning = format!("{}: {warning}", path.display());
     }
-    Ok(report)
+    report
 }

@@ -88,9 +88,9 @@ impl Draft {
 
 /// Extensions tried where a pose file names a picture without one (NeRF's blender
 /// scenes, some nerfstudio exports).
-pub(super) const EXTENSIONS: [&str; 18] = [
+pub(super) const EXTENSIONS: [&str; 21] = [
     "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "TIF", "bmp", "BMP", "heic",
-    "HEIC", "jfif", "jpe", "heif", "hif",
+    "HEIC", "jfif", "jpe", "heif", "hif", "mpo", "avif", "jxl",
 ];
 
 /// Searches for a picture below `roots`, with and without a folder of pictures between: `images`, or reduced

@@ -31,7 +31,8 @@ fn file(path: &Path, answer: Answer) -> Result<Value> {
     match extension.as_str() {
         "safetensors" => weights(path, answer),
         "json" | "txt" | "bin" => scene(path, answer),
-        "png" | "jpg" | "jpeg" | "webp" | "bmp" | "tif" | "tiff" | "heic" | "heif" => {
+        "png" | "jpg" | "jpeg" | "webp" | "bmp" | "tif" | "tiff" | "heic" | "heif" | "hif"
+        | "jfif" | "jpe" | "mpo" | "avif" | "jxl" | "dng" | "cr2" | "nef" | "arw" | "raf" => {
             picture(path, answer)
         }
         _ => bail!(

@@ -15,6 +15,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::files::SaveOptions;
 use subsplat::files::photos::image::{LoadOptions, Truncated};
+use subsplat::files::photos::notes::grouped;
 use subsplat::files::poses::scene::{Scene, SceneFormat};
 use subsplat::network::config::{Config, LowpassRef};
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
@@ -179,7 +180,8 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     Ok(Plan { scene, context, options })
 }
 
-/// Loads the photographs of a scene's `context` frames; `force` accepts truncated files.
+/// Loads the photographs of a scene's `context` frames; `force` accepts truncated files. Prints the warnings about
+/// their files, where the estimation of cameras has not.
 pub fn photographs(
     scene: &Scene,
     context: &[usize],
@@ -188,13 +190,22 @@ pub fn photographs(
 ) -> Result<Vec<Photo>> {
     let truncated = if force { Truncated::Accept } else { Truncated::Refuse };
     let options = LoadOptions { truncated };
-    progress.steps("photographs", context.len(), |bar| {
+    let mut warnings: Vec<(&Path, Vec<String>)> = Vec::new();
+    let photos = progress.steps("photographs", context.len(), |bar| {
         let photo = |&i: &usize| {
             bar.inc(1);
-            Ok(Photo::from_frame_with(&scene.frames[i], &options)?)
+            let frame = &scene.frames[i];
+            let mut loaded = frame.load_with(&options)?;
+            warnings.push((frame.image.as_path(), std::mem::take(&mut loaded.warnings)));
+            Ok(Photo::from_loaded(loaded))
         };
-        context.iter().map(photo).collect()
-    })
+        context.iter().map(photo).collect::<Result<_>>()
+    })?;
+    if scene.source != SceneFormat::Photographs {
+        let lines = warnings.iter().map(|(path, lines)| (*path, lines.as_slice()));
+        grouped(lines).iter().for_each(print_warning);
+    }
+    Ok(photos)
 }
 
 /// Chooses the context frames of the scene at `input`: those that `args` name, or a default. Returns
