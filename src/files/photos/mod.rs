@@ -1,4 +1,4 @@
-//! Photographs and pictures: decoding, metadata, lens distortion, sizes.
+//! Photographs and pictures: decoding, metadata, lens distortion, sizes; frames of videos.
 
 mod decode;
 pub mod exif;
@@ -12,3 +12,4 @@ pub mod photograph;
 pub mod resize;
 mod rgb_image;
 pub mod undistort;
+pub mod video;

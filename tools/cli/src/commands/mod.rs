@@ -8,6 +8,7 @@
 
 pub mod args;
 mod check;
+mod clip;
 pub mod depth_colour;
 pub mod environment;
 mod export;
