@@ -433,16 +433,17 @@ fn filters_of_chosen(info: &VideoInfo, frames: &[TakenFrame]) -> String {
     format!("{}{select},{scale}{colours}", deinterlace(info))
 }
 
-/// Filters from PQ or HLG of BT.2020 to sRGB. Linear light counts 100 cd/m² as 1 and 1000 cd/m² as the peak. Mobius
-/// keeps dark and middle values and compresses bright ones.
+/// Filters from PQ or HLG of BT.2020 to sRGB. Linear light of 203 cd/m² counts as 1: diffuse white (ITU-R BT.2408);
+/// 1000 cd/m² are the peak. Mobius keeps dark and middle values and compresses bright ones. An ordinary picture that
+/// was converted to HLG comes back at 26 dB (with 100 cd/m² as 1: 21 dB; with the curve `hable`: 13 to 18 dB).
 fn tone_mapping(hdr: Hdr) -> String {
     let transfer = match hdr {
         Hdr::Pq => "smpte2084",
         Hdr::Hlg => "arib-std-b67",
     };
     format!(
-        ",zscale=tin={transfer}:min=2020_ncl:pin=2020:t=linear:npl=100,format=gbrpf32le,zscale=p=709,\
-         tonemap=tonemap=mobius:desat=0:peak=10,zscale=t=iec61966-2-1:r=full,format=gbrp"
+        ",zscale=tin={transfer}:min=2020_ncl:pin=2020:t=linear:npl=203,format=gbrpf32le,zscale=p=709,\
+         tonemap=tonemap=mobius:desat=0:peak=5,zscale=t=iec61966-2-1:r=full,format=gbrp"
     )
 }
 

@@ -11,5 +11,6 @@ mod photographs_without_cameras;
 mod program;
 mod readme;
 mod readme_snippet;
+mod video_input;
 #[cfg(feature = "view")]
 mod view;
