@@ -2,6 +2,7 @@
 //! read is named with the reason.
 
 use super::photograph::probe_photograph;
+use super::video::is_video;
 use super::{heic, jxl, raw};
 use crate::files::Error;
 use crate::files::poses::assemble::{files, has_extension};
@@ -11,8 +12,6 @@ use std::path::{Path, PathBuf};
 
 /// Extensions of pictures beside the usual ones and the raw ones; some of the formats are not read.
 const OTHER_EXTENSIONS: [&str; 6] = ["gif", "exr", "hdr", "cr3", "raf", "insp"];
-/// Extensions of videos.
-const VIDEOS: [&str; 6] = ["mov", "mp4", "m4v", "avi", "mkv", "webm"];
 /// Extensions of pictures that every program reads. Cameras and phones write another format beside one of them, and
 /// people convert to them: a file of the same name is the same photograph.
 const COMMON_EXTENSIONS: [&str; 7] = ["jpg", "jpeg", "jpe", "jfif", "png", "tif", "tiff"];
@@ -28,6 +27,8 @@ pub struct FolderPhotographs {
     pub photographs: Vec<PathBuf>,
     /// Names of pictures that are left out, each with the reason.
     pub left_out: Vec<[String; 2]>,
+    /// Videos, which `left_out` names too.
+    pub videos: Vec<PathBuf>,
     /// Files `._*`, which macOS writes beside others and which are no pictures.
     pub companions: usize,
 }
@@ -63,8 +64,12 @@ impl FolderPhotographs {
 pub fn find_photographs(folder: impl AsRef<Path>) -> FolderPhotographs {
     let folder = folder.as_ref();
     let own = in_folder(folder);
-    if own.photographs.is_empty() && own.left_out.is_empty() {
-        return in_folder(&folder.join("images"));
+    if own.photographs.is_empty() && own.left_out.len() == own.videos.len() {
+        let mut images = in_folder(&folder.join("images"));
+        if own.videos.is_empty() || !images.photographs.is_empty() {
+            images.left_out.extend(own.left_out);
+            return images;
+        }
     }
     own
 }
@@ -72,9 +77,9 @@ pub fn find_photographs(folder: impl AsRef<Path>) -> FolderPhotographs {
 fn in_folder(folder: &Path) -> FolderPhotographs {
     let mut found = FolderPhotographs { companions: companions(folder), ..Default::default() };
     for path in files(folder).into_iter().filter(|path| is_picture(path)) {
-        let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        let reason = if VIDEOS.contains(&extension.as_str()) {
-            "a video: save frames of it as pictures".to_owned()
+        let reason = if is_moving(&path) {
+            found.videos.push(path.clone());
+            "a video; give the video alone to use frames of it".to_owned()
         } else {
             match probe_photograph(&path) {
                 Ok(_) => {
@@ -121,13 +126,19 @@ fn has_format_of_its_own(path: &Path) -> bool {
         || raw::EXTENSIONS.contains(&extension.as_str())
 }
 
+/// Returns whether a file is a video. A GIF in a folder may be a still picture.
+fn is_moving(path: &Path) -> bool {
+    let gif = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("gif"));
+    !gif && is_video(path)
+}
+
 /// Returns whether a file is, or is called, a picture or a video.
 fn is_picture(path: &Path) -> bool {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     if has_extension(path)
         || OTHER_EXTENSIONS.contains(&&*extension)
         || raw::EXTENSIONS.contains(&&*extension)
-        || VIDEOS.contains(&&*extension)
+        || is_moving(path)
     {
         return true;
     }

@@ -1,4 +1,4 @@
-//! Photographs and pictures: decoding, metadata, lens distortion, sizes.
+//! Photographs and pictures: decoding, metadata, lens distortion, sizes; frames of videos.
 
 mod converted;
 mod decode;
@@ -22,4 +22,5 @@ mod rgb_image;
 pub mod shape;
 mod tiff_tags;
 pub mod undistort;
+pub mod video;
 pub mod views;

@@ -9,6 +9,7 @@
 pub mod args;
 mod browser;
 mod check;
+mod clip;
 pub mod depth_colour;
 pub mod environment;
 mod export;

@@ -10,6 +10,7 @@ use subsplat::cameras::estimation::{Confidence, PoseOptions, Uncertain};
 use subsplat::files::photos::folder::{FolderPhotographs, find_photographs};
 use subsplat::files::photos::image::{LoadOptions, Truncated, probe};
 use subsplat::files::photos::photograph::{PhotographHeader, probe_photograph};
+use subsplat::files::photos::video::is_video;
 use subsplat::files::poses::find::{folders, is_own_output, not_read};
 use subsplat::files::poses::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
 use subsplat::files::poses::scene::{Scene, SceneFormat, has_scene, load_scene_with};
@@ -75,6 +76,13 @@ pub fn photographs(input: &[PathBuf], read: &ReadArgs) -> Result<Option<Vec<Path
              the scene with `subsplat view {}`",
             folder.display(),
             folder.join("scene.ply").display()
+        );
+    }
+    if let Some(video) = input.iter().find(|path| is_video(path)) {
+        bail!(
+            "{0}: expected photographs or a scene, got a video; `subsplat run {0} -o out` makes a scene of its \
+             frames, and `subsplat poses {0} -o out` their cameras",
+            video.display()
         );
     }
     if let [_] = input

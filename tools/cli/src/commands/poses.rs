@@ -1,6 +1,7 @@
 //! `subsplat poses`: cameras of photographs that come without any.
 
 use super::args::{PosesArgs, ReadArgs};
+use super::clip;
 use super::pair::{self, EstimateRequest};
 use crate::report::{Answer, Progress, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result, ensure};
@@ -18,6 +19,8 @@ use subsplat_kernels::camera::Camera;
 /// Runs the command.
 pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
+    let of_video = clip::of_poses(args, &mut progress)?;
+    let args = of_video.as_ref().unwrap_or(args);
     let read = ReadArgs { strict: args.strict, ..Default::default() };
     let photographs = pair::photographs(&args.input, &read)?.with_context(|| {
         format!("{}: expected photographs, got a scene with cameras", args.input[0].display())

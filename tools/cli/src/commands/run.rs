@@ -8,7 +8,7 @@ use super::html::Page;
 use super::info::print_left_out;
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
-use super::{browser, memory, model, pair, render, video};
+use super::{browser, clip, memory, model, pair, render, video};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
@@ -49,6 +49,8 @@ struct Plan {
 pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     args.motion.video.as_deref().map_or(Ok(()), video::check)?;
+    let of_video = clip::of_run(args, &mut progress)?;
+    let args = of_video.as_ref().unwrap_or(args);
     let mut plan = plan(args, &mut progress)?;
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);

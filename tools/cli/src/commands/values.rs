@@ -28,6 +28,11 @@ pub fn frames(text: &str) -> Result<usize, String> {
     whole(text, 1, PATH_MAX)
 }
 
+/// Parses a number of frames of a video.
+pub fn taken(text: &str) -> Result<usize, String> {
+    whole(text, 2, 100).map_err(|expected| format!("{expected} (10 to 60 do best)"))
+}
+
 /// Parses a number of threads.
 pub fn threads(text: &str) -> Result<usize, String> {
     whole(text, 1, THREADS_MAX)

@@ -12,6 +12,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use subsplat::files::photos::video::is_installed;
 use subsplat::image::ExtendedColorType::Rgb8;
 use subsplat::image::codecs::webp::WebPEncoder;
 use subsplat::scene::pictures::Rgb;
@@ -73,14 +74,8 @@ fn kind(path: &Path) -> Result<Kind> {
 /// An unknown extension; .mp4 or .webm without ffmpeg; no folder of that name.
 pub fn check(path: &Path) -> Result<()> {
     if matches!(kind(path)?, Kind::Mp4 | Kind::Webm) {
-        let found = Command::new("ffmpeg")
-            .arg("-version")
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .status();
         ensure!(
-            found.is_ok_and(|s| s.success()),
+            is_installed("ffmpeg"),
             "--video {}: .mp4 and .webm need the program ffmpeg, which was not found; install it, or \
              write .webp or .gif",
             path.display()

@@ -12,5 +12,6 @@ mod program;
 mod readme;
 mod readme_snippet;
 mod scene_options;
+mod video_input;
 #[cfg(feature = "view")]
 mod view;

@@ -6,16 +6,24 @@ use std::path::PathBuf;
 use subsplat::reconstruct::Projection;
 
 /// Arguments of `poses`.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct PosesArgs {
-    /// Photographs of one scene in any order, or a folder of them.
-    #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR")]
+    /// Photographs of one scene in any order, a folder of them, or a video.
+    ///
+    /// Of a video (ffmpeg reads it) sharp frames are taken where the camera has moved on, and kept in the folder
+    /// `frames` beside cameras.json.
+    #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR | VIDEO")]
     pub input: Vec<PathBuf>,
     /// A .json file for the cameras, or a folder for cameras.json and COLMAP's model.
     ///
     /// The folder gets cameras.json, and COLMAP's text model in sparse/0.
     #[arg(short, long, default_value = "poses", value_name = "FILE | DIR")]
     pub out: PathBuf,
+    /// Most frames to take from a video, 2 to 100.
+    ///
+    /// 10 to 60 do best. Default: as many as the camera's motion needs, 12 to 36.
+    #[arg(long, value_name = "N", value_parser = values::taken)]
+    pub frames: Option<usize>,
     /// Angle of view across, degrees; replaces EXIF's.
     ///
     /// It holds for all photographs. Without it, the focal length comes from EXIF, else it is estimated. The estimate from two

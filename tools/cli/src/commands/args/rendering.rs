@@ -65,11 +65,12 @@ impl PathArg {
 }
 
 /// Length, radius and animation of a path.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct MotionArgs {
     /// Number of views of a --path.
     ///
-    /// Default: 30; 3 for `run` without --path and without photographs to compare with.
+    /// Default: 30; 3 for `run` without --path and without photographs to compare with. Of a video, without --path and
+    /// --video: the most frames to take from it, as --take.
     #[arg(long, value_name = "N", value_parser = values::frames, help_heading = PICTURES)]
     pub frames: Option<usize>,
     /// Radius of --path orbit, spiral and dolly, in the unit of the cameras' positions.
@@ -103,7 +104,7 @@ pub struct MotionArgs {
 }
 
 /// Rendering options.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct RenderingArgs {
     /// Processor: cpu, auto, gpu, or a part of a GPU's name.
     ///

@@ -1,7 +1,7 @@
 //! Arguments of `run`.
 
 use super::files::{ContentArgs, SceneFormatArg};
-use super::groups::{PICTURES, SIZE};
+use super::groups::{CAMERAS, PICTURES, SIZE};
 use super::rendering::{MotionArgs, PathArg, RenderingArgs};
 use super::source::{QualityArg, SourceArgs};
 use crate::commands::values;
@@ -10,14 +10,15 @@ use std::path::PathBuf;
 use subsplat::{Size, TargetSize};
 
 /// Arguments of `run`.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct RunArgs {
-    /// Photographs, a folder of them, or a scene with cameras.
+    /// Photographs, a folder of them, a video, or a scene with cameras.
     ///
-    /// Of photographs alone the cameras are found first. A scene with cameras is a folder or a pose
+    /// Of photographs alone the cameras are found first. Of a video (ffmpeg reads it) sharp frames are taken where the
+    /// camera has moved on, and kept in the folder `frames` of the results. A scene with cameras is a folder or a pose
     /// file: cameras.json, transforms.json, COLMAP's model, RealEstate10K's txt, or poses.txt with
     /// K.txt.
-    #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR | SCENE")]
+    #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR | VIDEO | SCENE")]
     pub input: Vec<PathBuf>,
     /// Folder for the results.
     ///
@@ -46,6 +47,12 @@ pub struct RunArgs {
     /// made from, else none.
     #[arg(long, value_delimiter = ',', value_name = "I,J,…", help_heading = PICTURES)]
     pub target: Vec<String>,
+    /// Most frames to take from a video, 2 to 100.
+    ///
+    /// 10 to 60 do best. Default: as many as the camera's motion needs, 12 to 36. --frames says the same where neither
+    /// --path nor --video is given.
+    #[arg(long, value_name = "N", value_parser = values::taken, hide_short_help = true, help_heading = CAMERAS)]
+    pub take: Option<usize>,
     /// Length, radius and animation of a path.
     #[command(flatten)]
     pub motion: MotionArgs,
