@@ -78,7 +78,7 @@ fn check_frames(found: &EstimatedScene, photographs: usize) {
     errors.sort_by(f32::total_cmp);
     assert!(errors[errors.len() / 2] < 0.5, "{}", errors[errors.len() / 2]);
     let visible: usize = frames.iter().map(|f| f.visible.len()).sum();
-    assert_eq!(visible, found.observations.iter().map(Vec::len).sum());
+    assert_eq!(visible, found.observations.iter().map(Vec::len).sum::<usize>());
 }
 
 fn check_cameras(found: &EstimatedScene, turn: f64, direction: f64) {

@@ -279,17 +279,20 @@ mod tests {
     #[test]
     fn slopes_are_those_of_finite_differences() {
         let (pose, s) = sights(1, 0.0, 9);
-        let slope = projection_slope(&pose, s[0].point);
-        for i in 0..6 {
-            let at = |h: f64| {
-                let mut step = [0.0; 6];
-                step[i] = h;
-                let p = pose.moved(&step).to_camera(s[0].point);
-                p.truncate() / p.z
-            };
-            let numeric = (at(1e-6) - at(-1e-6)) / 2e-6;
-            let off = (numeric - DVec2::new(slope[(0, i)], slope[(1, i)])).length();
-            assert!(off < 1e-7, "{i}: {off}");
+        let turned = DMat3::from_rotation_y(0.4) * DMat3::from_rotation_x(-0.2);
+        for view in [None, Some(turned)] {
+            let slope = projection_slope(&pose, view, s[0].point);
+            for i in 0..6 {
+                let at = |h: f64| {
+                    let mut step = [0.0; 6];
+                    step[i] = h;
+                    let p = in_view(view, pose.moved(&step).to_camera(s[0].point));
+                    p.truncate() / p.z
+                };
+                let numeric = (at(1e-6) - at(-1e-6)) / 2e-6;
+                let off = (numeric - DVec2::new(slope[(0, i)], slope[(1, i)])).length();
+                assert!(off < 1e-6, "{view:?}, {i}: {off}");
+            }
         }
     }
 }

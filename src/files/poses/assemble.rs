@@ -518,7 +518,7 @@ fn view_intrinsics(draft: &Draft, view: &DraftView) -> Intrinsics {
             let [fx, fy, cx, cy] = lens.map(|v| v as f32);
             Intrinsics { fx, fy, cx, cy, ..k }
         }
-        Lens::Normalised(_) => k,
+        Lens::Normalised(_) | Lens::Centred(_) => k,
     }
 }
 

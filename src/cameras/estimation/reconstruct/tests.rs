@@ -45,6 +45,7 @@ fn photograph(points: &[DVec3], pose: &Absolute) -> PosePhoto {
         working: intrinsics,
         colours: vec![[0; 3]; bearings.len()],
         bearings,
+        views: Vec::new(),
     }
 }
 
