@@ -87,6 +87,7 @@ impl FisheyeCurve {
 
 /// Projection of one photograph, found or given.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[allow(clippy::large_enum_variant, reason = "one of each photograph")]
 enum Shape {
     Pinhole,
     /// The estimated camera is that of the view.

@@ -140,11 +140,8 @@ mod tests {
     use crate::cameras::check::{Finding, Verdict};
 
     fn agreement(consistent: f64, gain: f64) -> Agreement {
-        let mut agreement = Agreement::default();
-        agreement.consistent = consistent;
-        (agreement.shared, agreement.parallax) = (0.7, 0.1);
-        (agreement.over_surface, agreement.at_same_place) = (10.0 + gain, 10.0);
-        agreement
+        let (over_surface, at_same_place) = (10.0 + gain, 10.0);
+        Agreement { shared: 0.7, consistent, over_surface, at_same_place, parallax: 0.1 }
     }
 
     fn report(code: &str) -> PairReport {

@@ -559,6 +559,6 @@ fn cameras_are_found_by_content() {
     write(&at("reconstruction.json"), json!([opensfm(&cameras[..3])]).to_string());
     assert!(load_scene(folder.path()).unwrap().warnings.is_empty());
     // The matrices of this file: OpenGL's third column is the direction backward.
-    let third = DMat4::from(cameras[0].camera.world_from_camera().as_dmat4()).z_axis;
+    let third = cameras[0].camera.world_from_camera().as_dmat4().z_axis;
     assert_eq!(opengl_rows(&cameras[0].camera)[0][2], -third.x);
 }

@@ -145,8 +145,8 @@ fn bad_transforms_json() {
         ),
         (
             "unknown model",
-            transforms(|v| v["camera_model"] = json!("EQUIRECTANGULAR")),
-            &["EQUIRECTANGULAR", "OPENCV"],
+            transforms(|v| v["camera_model"] = json!("ORTHOPHOTO")),
+            &["ORTHOPHOTO", "OPENCV"],
         ),
         (
             "half a pixel",

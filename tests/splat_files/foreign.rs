@@ -24,7 +24,10 @@ fn row(i: usize) -> Vec<f32> {
     row
 }
 
-fn header(format: &str, elements: &[(&str, usize, Vec<(&str, String)>)]) -> Vec<u8> {
+/// Name, number of rows, and properties as name and type.
+type Element<'a> = (&'a str, usize, Vec<(&'a str, String)>);
+
+fn header(format: &str, elements: &[Element<'_>]) -> Vec<u8> {
     let mut text = format!("ply\nformat {format} 1.0\n");
     for (name, count, properties) in elements {
         text += &format!("element {name} {count}\n");
@@ -141,7 +144,7 @@ fn groups_by_degree_are_one_scene() {
     let rests = |d: usize| 3 * ((d + 1) * (d + 1) - 1);
     let elements: Vec<(String, usize)> =
         degrees.iter().map(|d| (format!("vertex_{d}"), *d)).collect();
-    let elements: Vec<(&str, usize, Vec<(&str, String)>)> = elements
+    let elements: Vec<Element<'_>> = elements
         .iter()
         .map(|(name, d)| {
             let rest = (0..rests(*d)).map(|i| ("short", format!("f_rest_{i}")));

@@ -65,12 +65,14 @@ pub(super) fn error(path: &Path, expected: &str, error: &serde_json::Error) -> E
 /// `bytes` in UTF-8 without a byte order mark. UTF-16 is known by its mark.
 pub(super) fn utf8(bytes: &[u8]) -> Cow<'_, [u8]> {
     let [little, big] = MARKS_16.map(|mark| bytes.strip_prefix(mark));
-    let (rest, unit): (&[u8], fn([u8; 2]) -> u16) = match (little, big) {
-        (Some(rest), _) => (rest, u16::from_le_bytes),
-        (None, Some(rest)) => (rest, u16::from_be_bytes),
-        (None, None) => return Cow::Borrowed(bytes.strip_prefix(MARK).unwrap_or(bytes)),
+    let Some(rest) = little.or(big) else {
+        return Cow::Borrowed(bytes.strip_prefix(MARK).unwrap_or(bytes));
     };
-    let units: Vec<u16> = rest.chunks_exact(2).map(|pair| unit([pair[0], pair[1]])).collect();
+    let unit = |pair: &[u8]| match little {
+        Some(_) => u16::from_le_bytes([pair[0], pair[1]]),
+        None => u16::from_be_bytes([pair[0], pair[1]]),
+    };
+    let units: Vec<u16> = rest.chunks_exact(2).map(unit).collect();
     Cow::Owned(String::from_utf16_lossy(&units).into_bytes())
 }
 

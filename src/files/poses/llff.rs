@@ -54,17 +54,17 @@ fn rows(path: &Path, bytes: &[u8]) -> Result<Vec<[f64; COLUMNS]>> {
         let expected = format!("an array N x {COLUMNS} by rows");
         return Err(bad(&expected, header.trim_end().to_owned()));
     };
-    let numbers: Vec<f64> = if header.contains("'<f8'") {
+    let (numbers, width): (Vec<f64>, usize) = if header.contains("'<f8'") {
         let number = |b: &[u8]| b.try_into().map_or(f64::NAN, f64::from_le_bytes);
-        bytes.chunks_exact(8).map(number).collect()
+        (bytes.chunks_exact(8).map(number).collect(), 8)
     } else if header.contains("'<f4'") {
         let number = |b: &[u8]| b.try_into().map_or(f64::NAN, |b| f64::from(f32::from_le_bytes(b)));
-        bytes.chunks_exact(4).map(number).collect()
+        (bytes.chunks_exact(4).map(number).collect(), 4)
     } else {
         return Err(bad("numbers `<f8` or `<f4`", header.trim_end().to_owned()));
     };
     let found = numbers.chunks_exact(COLUMNS);
-    if count == 0 || count != found.len() || !found.remainder().is_empty() {
+    if count == 0 || count != found.len() || bytes.len() != width * COLUMNS * count {
         let expected = format!("{count} rows of {COLUMNS} numbers, at least one row");
         return Err(bad(&expected, format!("{} bytes of numbers", bytes.len())));
     }

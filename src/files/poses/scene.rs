@@ -470,7 +470,7 @@ fn load_model(model: &Path, reading: &Reading<'_>) -> Result<Scene> {
     if metadata.is_file() {
         return load_file(model, reading);
     }
-    match find_in(model)? {
+    match find(model)? {
         Some(Found { file, .. }) => load_found(&file, reading),
         None => Err(Error::format(model, SCENES, "a folder with none of them")),
     }

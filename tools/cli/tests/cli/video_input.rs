@@ -11,7 +11,7 @@ use subsplat::scene::pictures::Rgb;
 /// Width and height of the clips, px.
 const SIZE: (usize, usize) = (320, 240);
 /// Frames of a clip, of which the first ones are taken from a tripod.
-const FRAMES: (usize, usize) = (90, 45);
+const FRAMES: (usize, usize) = (105, 60);
 
 /// Smooth noise in [0, 255] with detail of about four pixels.
 fn noise(x: f64, y: f64, seed: u64) -> f64 {
