@@ -8,3 +8,4 @@ mod raster_bwd;
 mod raster_bwd_oracle;
 mod raster_op;
 mod raster_oracle;
+mod separate;

@@ -150,6 +150,17 @@ kinds! {
     plain Plain saturated Saturated needles Needles behind Behind off_screen OffScreen flat Flat
 }
 
+/// Colours below 0 and above 1, of the splats themselves and of parents.
+#[test]
+fn colours_without_a_direction() {
+    let o = RasterOptions { sh_direction: ShDirection::Colour, ..options(Convention::Standard) };
+    for (seed, lanes) in [(21, 0), (22, 1), (23, 4)] {
+        let scene = Scene::new(Kind::Plain, seed, 4, 0, lanes);
+        assert!(scene.sh.iter().any(|v| *v < 0.0));
+        check(&scene, &o, 5e-4, &format!("colours, {lanes} numbers of gain"));
+    }
+}
+
 #[test]
 fn antialiasing_and_shared_directions() {
     let o = RasterOptions { antialiased: true, ..options(Convention::Standard) };

@@ -20,6 +20,17 @@ pub enum Geometry<'a> {
         /// `[N]`, after the sigmoid.
         opacities: &'a [f32],
     },
+    /// An array for each attribute, as applications outside this crate hold them.
+    Separate {
+        /// `[N, 3]`, world.
+        means: &'a [f32],
+        /// `[N, 4]`, wxyz, of any length but zero.
+        quats: &'a [f32],
+        /// `[N, 3]`: σ, world units.
+        scales: &'a [f32],
+        /// `[N]`, after the sigmoid.
+        opacities: &'a [f32],
+    },
 }
 
 /// Borrowed splats as the kernels read them. Lengths must match. Debug builds check them;
@@ -43,6 +54,10 @@ impl SplatSlices<'_> {
             Geometry::Packed(rows) => rows.len() / SPLAT_STRIDE,
             Geometry::Cov6 { means, cov6, opacities } => {
                 (means.len() / 3).min(cov6.len() / 6).min(opacities.len())
+            }
+            Geometry::Separate { means, quats, scales, opacities } => {
+                let shapes = (quats.len() / 4).min(scales.len() / 3);
+                (means.len() / 3).min(shapes).min(opacities.len())
             }
         }
     }
@@ -70,6 +85,10 @@ impl SplatSlices<'_> {
             Geometry::Cov6 { means, cov6, opacities } => {
                 means.len() == 3 * n && cov6.len() == 6 * n && opacities.len() == n
             }
+            Geometry::Separate { means, quats, scales, opacities } => {
+                let shapes = quats.len() == 4 * n && scales.len() == 3 * n;
+                means.len() == 3 * n && shapes && opacities.len() == n
+            }
         };
         let p = self.parents();
         let sh = self.sh.len() == p * 3 * sh_coefficients(self.sh_degree);
@@ -81,7 +100,9 @@ impl SplatSlices<'_> {
     pub(crate) fn mean(&self, i: usize) -> [f32; 3] {
         match self.geometry {
             Geometry::Packed(rows) => floats_at(rows, i * SPLAT_STRIDE + MEAN_OFFSET),
-            Geometry::Cov6 { means, .. } => floats_at(means, 3 * i),
+            Geometry::Cov6 { means, .. } | Geometry::Separate { means, .. } => {
+                floats_at(means, 3 * i)
+            }
         }
     }
 }
@@ -98,12 +119,16 @@ pub struct Gradients {
     /// `[N, 11]` for [`Geometry::Packed`], offsets in [`crate::layout`] (the quaternion's
     /// gradient passes through its normalisation); else empty.
     pub rows: Vec<f32>,
-    /// `[N, 3]` for [`Geometry::Cov6`], else empty.
+    /// `[N, 3]` unless [`Geometry::Packed`]; there empty.
     pub means: Vec<f32>,
     /// `[N, 6]` for [`Geometry::Cov6`], else empty. An off-diagonal gradient is that of both
     /// entries of the matrix.
     pub cov6: Vec<f32>,
-    /// `[N]` for [`Geometry::Cov6`], else empty.
+    /// `[N, 4]` for [`Geometry::Separate`], else empty. It passes through the normalisation.
+    pub quats: Vec<f32>,
+    /// `[N, 3]` for [`Geometry::Separate`], else empty.
+    pub scales: Vec<f32>,
+    /// `[N]` unless [`Geometry::Packed`]; there empty.
     pub opacities: Vec<f32>,
     /// `[P, D, 3]`: summed over the children of each parent. D is [`Gradients::coefficients`].
     pub sh: Vec<f32>,
@@ -120,12 +145,17 @@ impl Gradients {
     /// Resizes every buffer for `splats`.
     pub(crate) fn fit(&mut self, splats: &SplatSlices) {
         let n = splats.len();
-        let packed = matches!(splats.geometry, Geometry::Packed(_));
-        let (packed, cov) = if packed { (n, 0) } else { (0, n) };
+        let (packed, cov, separate) = match splats.geometry {
+            Geometry::Packed(_) => (n, 0, 0),
+            Geometry::Cov6 { .. } => (0, n, 0),
+            Geometry::Separate { .. } => (0, 0, n),
+        };
         self.rows.resize(packed * SPLAT_STRIDE, 0.0);
-        self.means.resize(3 * cov, 0.0);
+        self.means.resize(3 * (cov + separate), 0.0);
         self.cov6.resize(6 * cov, 0.0);
-        self.opacities.resize(cov, 0.0);
+        self.quats.resize(4 * separate, 0.0);
+        self.scales.resize(3 * separate, 0.0);
+        self.opacities.resize(cov + separate, 0.0);
         self.sh.resize(splats.parents() * 3 * self.coefficients(splats.sh_degree), 0.0);
         self.gain.resize(splats.gain.len(), 0.0);
     }

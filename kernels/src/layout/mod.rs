@@ -131,6 +131,10 @@ pub enum ShDirection {
     Child,
     /// Towards the mean of a parent's children: one SH evaluation per parent and camera.
     Parent,
+    /// None: an SH set of degree 0 is the colour itself, of any sign, without the term ½ and without
+    /// a lower bound (gsplat's `colors`). The rasterizer of the CPU alone has it. Not for files.
+    #[serde(skip)]
+    Colour,
 }
 
 /// Options of one rasterizer call.

@@ -129,6 +129,11 @@ fn colour(splat: &Splat, eye: [f64; 3], options: &RasterOptions) -> [f64; 3] {
     let from = match options.sh_direction {
         ShDirection::Child => splat.mean.map(f64::from),
         ShDirection::Parent => splat.parent_mean,
+        ShDirection::Colour => {
+            return std::array::from_fn(|c| {
+                f64::from(splat.gain) * f64::from(splat.sh[0][c]) + f64::from(splat.residual[c])
+            });
+        }
     };
     let d = [from[0] - eye[0], from[1] - eye[1], from[2] - eye[2]];
     let n = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();

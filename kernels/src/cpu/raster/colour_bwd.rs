@@ -185,6 +185,37 @@ impl Pass<'_> {
         }
     }
 
+    /// Gradients of colours and gain without a direction. `single`: as of `child_colours`.
+    #[inline(always)]
+    pub(crate) fn plain_colours(
+        &self,
+        part: &mut Part,
+        (at, single): (usize, bool),
+        alive: u32,
+        group: &Group,
+    ) {
+        let children = self.splats.children_per_parent();
+        let set = part.set;
+        for l in 0..GROUP.min(part.len - at) {
+            let i = part.first + at + l;
+            let seen = alive & (1 << l) != 0;
+            let rgb: [f32; 3] = std::array::from_fn(|c| group.sums[6 + c][l]);
+            let sh = sh_of_parent(self.splats, i / children);
+            let value = rgb.iter().zip(sh).map(|(g, c)| g * c).sum();
+            let gain = gain_of(self.splats, i);
+            let p = (at + l) / children;
+            if let Some(to) = part.sh.get_mut(p * set..(p + 1) * set) {
+                if single {
+                    to.fill(0.0);
+                }
+                if seen {
+                    to.iter_mut().zip(rgb).for_each(|(to, g)| *to += gain * g);
+                }
+            }
+            part.put_gain(at + l, if seen { value } else { 0.0 }, rgb);
+        }
+    }
+
     /// Returns whether [`WIDE`] coefficients of each SH set are used.
     pub(crate) fn wide(&self) -> bool {
         self.used() == WIDE

@@ -68,6 +68,7 @@ impl Projection {
         let degree = options.sh_degree.min(splats.sh_degree);
         let functions = ShFunctions { basis: options.sh_basis, degree };
         let shared = options.sh_direction == ShDirection::Parent;
+        let plain = options.sh_direction == ShDirection::Colour;
         self.parents.clear();
         if shared {
             let children = splats.children_per_parent();
@@ -87,6 +88,7 @@ impl Projection {
                 view,
                 functions,
                 parents,
+                plain,
                 first: c * chunk,
                 footprints,
                 cover,
@@ -154,6 +156,8 @@ struct Chunk<'a> {
     view: &'a View,
     functions: ShFunctions,
     parents: Option<&'a [[f32; 3]]>,
+    /// SH sets are colours ([`ShDirection::Colour`]).
+    plain: bool,
     /// First splat.
     first: usize,
     footprints: &'a mut [Footprint],
@@ -286,6 +290,21 @@ impl Chunk<'_> {
                 let mean = [s.load(&x), s.load(&y), s.load(&z)];
                 self.view.project(s, mean, Shape::Cov6(&shapes), s.load(&opacity))
             }
+            Geometry::Separate { quats, scales, opacities, .. } => {
+                let mut columns = [[0.0; LANES]; 11];
+                for (l, &i) in index.iter().enumerate() {
+                    let [x, y, z] = self.splats.mean(i);
+                    let [qw, qx, qy, qz] = floats_at(quats, 4 * i);
+                    let [sx, sy, sz] = floats_at(scales, 3 * i);
+                    let row = [x, y, z, qw, qx, qy, qz, sx, sy, sz, opacities[i]];
+                    for (column, v) in columns.iter_mut().zip(row) {
+                        column[l] = v;
+                    }
+                }
+                let [x, y, z, qw, qx, qy, qz, sx, sy, sz, opacity] = columns.map(|v| s.load(&v));
+                let shape = Shape::Quat([qw, qx, qy, qz], [sx, sy, sz]);
+                self.view.project(s, [x, y, z], shape, opacity)
+            }
         }
     }
 
@@ -305,6 +324,13 @@ impl Chunk<'_> {
                 (lanes[0][l], lanes[1][l], lanes[2][l]) = (rgb[0], rgb[1], rgb[2]);
             }
             [s.load(&lanes[0]), s.load(&lanes[1]), s.load(&lanes[2])]
+        } else if self.plain {
+            let set = 3 * sh_coefficients(splats.sh_degree);
+            for (l, i) in index.iter().enumerate() {
+                let [r, g, b] = floats_at(splats.sh, i / children * set);
+                (lanes[0][l], lanes[1][l], lanes[2][l]) = (r, g, b);
+            }
+            [s.load(&lanes[0]), s.load(&lanes[1]), s.load(&lanes[2])]
         } else {
             let set = 3 * sh_coefficients(splats.sh_degree);
             let mean = match splats.geometry {
@@ -313,7 +339,7 @@ impl Chunk<'_> {
                         s.gather4(rows, &index.map(|i| i * SPLAT_STRIDE), MEAN_OFFSET);
                     [x, y, z]
                 }
-                Geometry::Cov6 { .. } => {
+                Geometry::Cov6 { .. } | Geometry::Separate { .. } => {
                     for (l, &i) in index.iter().enumerate() {
                         let m = splats.mean(i);
                         (lanes[0][l], lanes[1][l], lanes[2][l]) = (m[0], m[1], m[2]);
@@ -329,13 +355,14 @@ impl Chunk<'_> {
             radiance_lanes(s, self.functions, d, splats.sh, &at.map(|p| p * set))
         };
         let (gain, residual) = self.gain(s, &index);
-        let half = s.splat(0.5);
+        let (half, least) = if self.plain { (0.0, f32::NEG_INFINITY) } else { (0.5, 0.0) };
+        let (half, least) = (s.splat(half), s.splat(least));
         let infinity = s.splat(f32::INFINITY);
         let mut good = half.lt(infinity);
         for c in 0..3 {
             let v = gain.fma(sum[c], half) + residual[c];
             good = good & v.abs().lt(infinity);
-            s.store(s.splat(0.0).max(v), &mut lanes[c]);
+            s.store(least.max(v), &mut lanes[c]);
         }
         let good = good.to_bits();
         for (l, &i) in group[..count].iter().enumerate() {

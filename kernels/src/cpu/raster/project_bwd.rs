@@ -48,6 +48,8 @@ pub(crate) struct Part<'a> {
     rows: &'a mut [f32],
     means: &'a mut [f32],
     cov6: &'a mut [f32],
+    quats: &'a mut [f32],
+    scales: &'a mut [f32],
     opacities: &'a mut [f32],
     pub(crate) sh: &'a mut [f32],
     /// Numbers of a parent in `sh`.
@@ -100,6 +102,8 @@ impl Pass<'_> {
         let mut rows = out.rows.chunks_mut(len * SPLAT_STRIDE);
         let mut means = out.means.chunks_mut(3 * len);
         let mut cov6 = out.cov6.chunks_mut(6 * len);
+        let mut quats = out.quats.chunks_mut(4 * len);
+        let mut scales = out.scales.chunks_mut(3 * len);
         let mut opacities = out.opacities.chunks_mut(len);
         let mut sh = out.sh.chunks_mut((families * set).max(1));
         let mut gain = out.gain.chunks_mut((len * gain_channels).max(1));
@@ -111,6 +115,8 @@ impl Pass<'_> {
                 rows: rows.next().unwrap_or_default(),
                 means: means.next().unwrap_or_default(),
                 cov6: cov6.next().unwrap_or_default(),
+                quats: quats.next().unwrap_or_default(),
+                scales: scales.next().unwrap_or_default(),
                 opacities: opacities.next().unwrap_or_default(),
                 sh: sh.next().unwrap_or_default(),
                 set,
@@ -124,6 +130,7 @@ impl Pass<'_> {
     #[inline(always)]
     fn part<S: Simd>(&self, s: S, mut part: Part) {
         let shared = self.options.sh_direction == ShDirection::Parent;
+        let plain = self.options.sh_direction == ShDirection::Colour;
         // Without siblings, every SH set is written once; or first written, then added to.
         let single = !shared && (self.splats.children_per_parent() == 1 || self.wide());
         if !single {
@@ -140,7 +147,9 @@ impl Pass<'_> {
                 continue;
             }
             self.geometry(&mut group);
-            if !shared {
+            if plain {
+                self.plain_colours(&mut part, (at, single), alive, &group);
+            } else if !shared {
                 self.child_colours(s, &mut part, (at, single), alive, &mut group, &mut seen);
             } else {
                 self.parent_gains(&mut part, at, count, &group);
@@ -178,6 +187,11 @@ impl Pass<'_> {
                             put::<6>(&mut group.cov6, l, floats_at(cov6, 6 * i));
                             group.opacity[l] = opacities[i];
                         }
+                        Geometry::Separate { quats, scales, opacities, .. } => {
+                            put::<4>(&mut group.quat, l, floats_at(quats, 4 * i));
+                            put::<3>(&mut group.scale, l, floats_at(scales, 3 * i));
+                            group.opacity[l] = opacities[i];
+                        }
                     }
                 }
                 None => {
@@ -200,6 +214,9 @@ impl Pass<'_> {
     #[inline(always)]
     pub(crate) fn sums_of(&self, i: usize) -> [f32; SUMS] {
         let mut sums = self.sums[i];
+        if self.options.sh_direction == ShDirection::Colour {
+            return sums;
+        }
         for (v, colour) in sums[6..9].iter_mut().zip(self.footprints[i].rgb) {
             *v = if colour > 0.0 { *v } else { 0.0 };
         }
@@ -252,6 +269,8 @@ impl Part<'_> {
         zero(self.rows, SPLAT_STRIDE);
         zero(self.means, 3);
         zero(self.cov6, 6);
+        zero(self.quats, 4);
+        zero(self.scales, 3);
         zero(self.opacities, 1);
         zero(self.gain, self.gain_channels);
         if let Some(children) = children {
@@ -268,7 +287,10 @@ impl Part<'_> {
             let j = at + l;
             if self.rows.is_empty() {
                 set(self.means, 3 * j, get::<3>(&group.d_mean, l));
+                // Of the following three, those of another geometry are empty.
                 set(self.cov6, 6 * j, get::<6>(&group.d_cov6, l));
+                set(self.quats, 4 * j, get::<4>(&group.d_quat, l));
+                set(self.scales, 3 * j, get::<3>(&group.d_scale, l));
                 set(self.opacities, j, [group.d_opacity[l]]);
             } else {
                 let row = &mut self.rows[j * SPLAT_STRIDE..(j + 1) * SPLAT_STRIDE];

@@ -241,12 +241,23 @@ pub(crate) fn composite(
 }
 
 /// Returns the uniform for all splats and the whole picture, without a capacity.
+///
+/// # Errors
+/// [`GpuError::Argument`] for [`ShDirection::Colour`], which the CPU alone has.
 pub(crate) fn uniform(
     scene: &Scene,
     camera: &Camera,
     options: &RasterOptions,
     channels: Channels,
-) -> RasterUniform {
+) -> Result<RasterUniform, GpuError> {
+    if options.sh_direction == ShDirection::Colour {
+        return Err(GpuError::Argument {
+            kernel: PROJECT.name,
+            argument: "sh_direction",
+            expected: "child or parent".to_owned(),
+            got: "colour".to_owned(),
+        });
+    }
     let view = View::new(camera, options);
     let rules = BlendRules::new(options.convention);
     let row = |i: usize| {
@@ -261,7 +272,7 @@ pub(crate) fn uniform(
         Channels::Planes => (1, width * height),
     };
     let flag = u32::from;
-    RasterUniform {
+    Ok(RasterUniform {
         right: row(0),
         down: row(1),
         ahead: row(2),
@@ -291,5 +302,5 @@ pub(crate) fn uniform(
         step,
         channel,
         ..RasterUniform::default()
-    }
+    })
 }

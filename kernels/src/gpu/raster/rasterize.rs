@@ -182,7 +182,7 @@ impl Rasterizer {
         options: &RasterOptions,
         channels: Channels,
     ) -> Result<RenderedFrame, GpuError> {
-        let call = uniform(scene, camera, options, channels);
+        let call = uniform(scene, camera, options, channels)?;
         loop {
             if self.needs_layers(scene, &call) {
                 let picture = self.layered_picture(scene, &call)?;

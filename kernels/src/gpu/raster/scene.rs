@@ -120,7 +120,8 @@ impl Gpu {
     /// Copies splats to the device.
     ///
     /// # Errors
-    /// [`GpuError::Argument`] for inconsistent lengths; [`GpuError::OutOfMemory`].
+    /// [`GpuError::Argument`] for inconsistent lengths and for [`Geometry::Separate`], which the CPU alone
+    /// reads; [`GpuError::OutOfMemory`].
     pub fn upload_splats(&self, splats: &SplatSlices) -> Result<Scene, GpuError> {
         let n = splats.len();
         if !splats.is_consistent() {
@@ -137,6 +138,14 @@ impl Gpu {
             Geometry::Cov6 { means, cov6, opacities } => {
                 joined_rows = covariance_rows(means, cov6, opacities);
                 (&joined_rows[..], COV6_STRIDE)
+            }
+            Geometry::Separate { .. } => {
+                return Err(GpuError::Argument {
+                    kernel: "project",
+                    argument: "splats",
+                    expected: "packed rows or covariances".to_owned(),
+                    got: "separate arrays".to_owned(),
+                });
             }
         };
         let children = splats.children_per_parent();

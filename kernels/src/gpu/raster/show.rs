@@ -51,7 +51,7 @@ impl Rasterizer {
         if let Some(plan) = self.pending.take() {
             self.update_capacity(&plan.take(&gpu)?);
         }
-        let call = uniform(scene, camera, options, Channels::Interleaved);
+        let call = uniform(scene, camera, options, Channels::Interleaved)?;
         loop {
             if self.needs_layers(scene, &call) {
                 let show = |commands: &mut Commands, call: &RasterUniform, picture: &Buffer| {

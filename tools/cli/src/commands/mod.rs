@@ -1,5 +1,5 @@
 //! The commands, one file each. The public modules are those that a second program shares:
-//! arguments and their values, frames, memory, the model of the arguments, animations, and the
+//! arguments and their values, frames, memory, the model of the arguments, animations, pages, and the
 //! environment; beside [`crate::report`] and [`crate::failure`].
 //!
 //! Exit codes: 0 success; 1 an error, reported on stderr; 2 wrong usage; 3 a negative answer
@@ -14,7 +14,7 @@ pub mod depth_colour;
 pub mod environment;
 mod export;
 pub mod frames;
-mod html;
+pub mod html;
 mod info;
 pub mod memory;
 pub mod model;
