@@ -14,14 +14,17 @@ use subsplat_kernels::layout::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOption
 
 const TEMPLATE: &str = include_str!("../../../web/scene.html");
 const STYLE: &str = include_str!("../../../web/viewer.css");
-const VIEWER: &str = include_str!("../../../web/viewer.js");
+const VIEWER: &str =
+    concat!(include_str!("../../../web/range.js"), include_str!("../../../web/viewer.js"));
 
 /// A scene to be written.
 pub struct Page<'a> {
     /// The Gaussians.
     pub splats: &'a Splats,
-    /// Places that the viewer offers, its first one first; without any it shows the whole scene.
-    pub cameras: &'a [Camera],
+    /// Names and places that the viewer offers, its first one first; without any it shows the whole scene.
+    pub cameras: &'a [(String, Camera)],
+    /// Whether the cameras are those of the photographs that the scene was made from.
+    pub photographs: bool,
     /// Near plane, low-pass and background of the viewer.
     pub options: &'a RasterOptions,
     /// Title of the page.
@@ -67,11 +70,17 @@ impl Page<'_> {
             Convention::Standard => self.options.near,
             Convention::Mvsplat => NEAR_MVSPLAT * self.options.near,
         };
+        let camera = |(name, camera): &(String, Camera)| {
+            let mut value = json!(camera);
+            value["name"] = json!(name);
+            value
+        };
         let settings = json!({
             "background": self.options.background,
             "near": near,
             "lowpass": self.options.lowpass,
-            "cameras": self.cameras,
+            "photographs": self.photographs,
+            "cameras": self.cameras.iter().map(camera).collect::<Vec<_>>(),
         });
         // No text may end the script element.
         settings.to_string().replace('<', "\\u003c")
