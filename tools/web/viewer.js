@@ -1161,15 +1161,16 @@ class SplatViewer {
       if (this.swinging !== swing) return;
       begin ??= now;
       swing.since ??= now;
-      // Frames come unevenly where the graphics card is behind: a mean of ten.
-      if (swing.frames++ === 10) {
-        if (!asked && now - swing.since > 10 * SLOW) {
+      // Frames come unevenly where the graphics card is behind: those of the time of ten slow ones count.
+      swing.frames++;
+      if (now - swing.since > 10 * SLOW) {
+        if (!asked && swing.frames < 10) {
           this.swinging = null;
           Object.assign(this, { rotation, eye });
           this.redraw();
           return;
         }
-        Object.assign(swing, { frames: 1, since: now });
+        Object.assign(swing, { frames: 0, since: now });
       }
       const seconds = (now - begin) / 1000, turn = 2 * Math.PI * seconds / SWING_SECONDS;
       const wide = size * Math.min(seconds / 3, 1);

@@ -68,13 +68,13 @@ impl Request {
 }
 
 /// Shortest and longest focal length that a person may give, mm of 35 mm film.
-const FOCAL_MM: RangeInclusive<f32> = 8.0..=400.0;
+const FOCAL_MM: [f32; 2] = [8.0, 400.0];
 /// Diagonal of a photograph on 35 mm film, mm.
 const FILM_DIAGONAL_MM: f32 = 43.27;
 
 fn focal(text: String) -> Result<f32, String> {
-    let found = text.parse().ok().filter(|mm| FOCAL_MM.contains(mm));
-    let (least, most) = (FOCAL_MM.start(), FOCAL_MM.end());
+    let [least, most] = FOCAL_MM;
+    let found = text.parse::<f32>().ok().filter(|mm| (least..=most).contains(mm));
     found.ok_or_else(|| format!("Focal length: expected {least} to {most} mm, got {text:?}"))
 }
 
