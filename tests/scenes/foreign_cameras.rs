@@ -4,7 +4,7 @@
 use subsplat_test_support::made_up::made_up;
 use subsplat_test_support::noise::noise;
 
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat3, DVec3};
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::files::Error;
