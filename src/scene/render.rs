@@ -6,8 +6,7 @@ mod image;
 
 pub use comment::{
     camera_of_comments, comment_of_camera, comment_of_options, comment_of_origin,
-    comment_of_photograph, comments_without_camera, options_of_comments, origin_of_comments,
-    photographs_of_comments,
+    comments_without_camera, options_of_comments, origin_of_comments,
 };
 pub use device::{DeviceError, Renderer};
 

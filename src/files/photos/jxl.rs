@@ -1,6 +1,6 @@
 //! JPEG XL (ISO/IEC 18181): size and EXIF of a file, and its pixels with feature `jxl`.
 //!
-//! `jxl-oxide` decodes: pure Rust, MIT or Apache-2.0, kept since 2022. The official `jxl` is pure Rust too and
+//! `jxl-oxide` decodes: pure Rust, MIT or Apache-2.0. The official `jxl` is pure Rust too and
 //! has no decoder for the `image` crate. Without the feature a program converts the file (`programs.rs`).
 
 use super::heif::find;

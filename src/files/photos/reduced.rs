@@ -78,7 +78,7 @@ fn decode_jpeg(bytes: &[u8], factor: u32) -> Decoded {
         return Err("a JPEG that is lossless, or neither grey nor in colour".to_owned());
     };
     let coefficients = 2 * u64::from(components) * u64::from(w) * u64::from(h);
-    if layout.progressive && coefficients > WORKING_LIMIT * 4 {
+    if layout.progressive && coefficients > WORKING_LIMIT {
         return Err(format!(
             "a progressive JPEG of {w}x{h} pixels, which needs {} MiB while it is read (save it without progression)",
             coefficients >> 20

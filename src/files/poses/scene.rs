@@ -11,6 +11,7 @@
 
 use super::assemble::{self, Draft, Lens, Pictures, assemble};
 use super::find::{Found, PoseFile, find, find_in, not_read};
+#[cfg(feature = "network")]
 use super::panoramas::DraftView;
 use super::reading::{Reading, SceneOptions};
 use super::{
@@ -26,7 +27,9 @@ use crate::files::{Error, Result};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::{DVec3, Vec3};
-use std::collections::{HashMap, HashSet};
+#[cfg(feature = "network")]
+use std::collections::HashMap;
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use subsplat_kernels::camera::{Camera, NearFar};
 
@@ -315,6 +318,7 @@ impl Scene {
     }
 
     /// [`Scene::from_photographs`] of photographs and of views of them.
+    #[cfg(feature = "network")]
     pub(crate) fn from_views(
         source: SceneFormat,
         path: &Path,
@@ -337,6 +341,7 @@ impl Scene {
 }
 
 /// A photograph, or a view of one, with its camera.
+#[cfg(feature = "network")]
 #[derive(Clone, Debug)]
 pub(crate) struct PosedView {
     /// File.

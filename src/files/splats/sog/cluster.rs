@@ -2,8 +2,8 @@
 //!
 //! Both depend on the numbers alone: sums run in the order of the input, and threads share no sum.
 //! A tree costs O(N·dims·log K), where k-means costs O(N·dims·K): 65,536 rows for a million
-//! Gaussians take seconds instead of hours. Its rounding error, measured on random SH and on those
-//! of a scene, is some percent above that of k-means.
+//! Gaussians take seconds instead of hours. Its squared rounding error is 31 % above that of k-means
+//! on random vectors of 9 numbers (100 rows for 3000 vectors).
 
 use rayon::prelude::*;
 

@@ -1,6 +1,6 @@
 //! PlayCanvas' SOG: 8-bit pictures of numbers, one pixel a Gaussian, and `meta.json`; in a zip
-//! (`.sog`) or in a folder. About 16 bytes per Gaussian with SH of degree 3. Reads versions 1
-//! and 2, writes the zip of version 2.
+//! (`.sog`) or in a folder. A scene of 16,384 Gaussians with SH of degree 3 takes 49 bytes per
+//! Gaussian, 58 as .spz 3. Reads versions 1 and 2, writes the zip of version 2.
 //!
 //! | picture | channels | version 2 | version 1 |
 //! |---|---|---|---|

@@ -12,7 +12,6 @@ use subsplat::files::{SaveOptions, SplatFormat, save_splats};
 use subsplat::finish::reduce;
 use subsplat::scene::render::{
     Renderer, camera_of_comments, comments_without_camera, options_of_comments, origin_of_comments,
-    photographs_of_comments,
 };
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{Convention, RasterOptions};
@@ -36,8 +35,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     comments.retain(|comment| !is_own_comment(comment));
     let stored = options_of_comments(&comments);
     let all = splats.len();
-    // The comments of `run` hold the photographs, of earlier versions the first one; cameras.json the views.
-    let photographs = photographs_of_comments(&comments);
+    // cameras.json of `run` holds the views, the comment the first photograph.
     let own = camera_of_comments(&comments);
     let beside = if html || args.gaussians.is_some() {
         render::cameras_beside(
@@ -86,14 +84,12 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             );
         }
         let title = file.file_stem().unwrap_or_default().to_string_lossy();
-        let given = args.cameras.is_some() && beside.is_some();
-        let from_comments = !given && !photographs.is_empty();
         let first = || own.into_iter().map(|camera| (String::new(), camera)).collect();
-        let cameras = if from_comments { photographs } else { beside.unwrap_or_else(first) };
+        let cameras = beside.unwrap_or_else(first);
         let page = Page {
             splats: &splats,
             cameras: &cameras,
-            photographs: from_comments,
+            photographs: false,
             options: &options,
             title: &title,
         };

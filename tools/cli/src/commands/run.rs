@@ -23,9 +23,7 @@ use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
 use subsplat::reconstruct::{Assessment, Backend};
 use subsplat::scene::pictures::Rgb;
-use subsplat::scene::render::{
-    comment_of_camera, comment_of_options, comment_of_origin, comment_of_photograph,
-};
+use subsplat::scene::render::{comment_of_camera, comment_of_options, comment_of_origin};
 use subsplat::scene::score::GaussianReport;
 use subsplat::scene::splats::{SplatStatistics, Splats};
 use subsplat::{
@@ -106,9 +104,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         let name = |i: &usize| plan.scene.frames[*i].name.clone();
         let places = result.inputs().iter().map(|c| c.target_camera);
         let cameras: Vec<(String, Camera)> = plan.context.iter().map(name).zip(places).collect();
-        let photographs = cameras.iter().map(|(name, camera)| comment_of_photograph(name, camera));
         let comments = std::iter::once(comment_of_options(&options));
-        let comments = comments.chain(camera).chain(photographs).chain(origin).collect();
+        let comments = comments.chain(camera).chain(origin).collect();
         let save = SaveOptions {
             sh_degree: output::written_degree(args.content.sh, count, degree),
             min_opacity: args.content.min_opacity,

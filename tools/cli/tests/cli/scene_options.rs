@@ -43,7 +43,7 @@ fn models_pictures_and_axes_are_chosen() {
     let (wrong, right) = (reports(""), reports("--pose-convention opencv-c2w"));
     assert_ne!(wrong["baseline"], Value::Null);
     assert_eq!(wrong["baseline"], right["baseline"]);
-    assert_ne!(wrong["verdict"], right["verdict"], "{wrong} {right}");
+    assert_ne!(wrong["overlap"], right["overlap"], "{wrong} {right}");
 }
 
 /// Entries that are left out are listed at the end, and `render` refuses splats that are no numbers.

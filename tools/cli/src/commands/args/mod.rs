@@ -67,7 +67,13 @@ pub struct Cli {
     /// Number of threads (default: one for each core).
     ///
     /// The result does not depend on it. The environment variable RAYON_NUM_THREADS sets it too.
-    #[arg(long, global = true, value_name = "N", value_parser = values::threads)]
+    #[arg(
+        long,
+        global = true,
+        hide_short_help = true,
+        value_name = "N",
+        value_parser = values::threads
+    )]
     pub threads: Option<usize>,
 }
 
