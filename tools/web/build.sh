@@ -15,7 +15,7 @@ cargo run --locked --release --quiet --manifest-path tools/web/bindgen/Cargo.tom
 mkdir -p "$out"
 # Servers like `python3 -m http.server` compress nothing; the page unpacks the file itself.
 gzip -9 -n -c "$places/web-bindgen/out/subsplat_bg.wasm" >"$out/subsplat.wasm.gz"
-files=(index.html page.css page.js range.js scene.html viewer.css viewer.js worker.js)
+files=(index.html page.css page.js viewer.css viewer.js worker.js)
 cp "${files[@]/#/tools/web/}" "$places/web-bindgen/out/subsplat_bg.js" "$out"
 cd "$out"
 bytes=$(cat "${files[@]}" subsplat_bg.js subsplat.wasm.gz | wc -c)

@@ -32,8 +32,6 @@ let task = 0;
 const waiting = new Map();
 let viewer = null;
 let photographs = [];
-/** The scene that is shown: its .spz and the viewer's settings. */
-let finished = null;
 
 function stopWorker(reason) {
   worker?.terminate();
@@ -66,19 +64,9 @@ function ask(message, transfer = []) {
   });
 }
 
-/** What messages of the library advise by flags of the program, and the page's controls in their place. */
-const ADVICE = [
-  [/give --fov or --intrinsics/g, "fill in the field “Focal length”"],
-  [/give --fov/g, "fill in the field “Focal length”"],
-  [/; give --near and --far if you know them/g, ""],
-  [/, and give these with --fov 90/g, ", and choose these with a focal length of 18 mm"],
-  [/; or build with the feature `heic`/g, ""],
-];
-const advised = (text) => ADVICE.reduce((said, [flag, control]) => said.replace(flag, control), text);
-
 function showError(text) {
   find("error").hidden = !text;
-  find("error").textContent = advised(text ?? "");
+  find("error").textContent = text ?? "";
 }
 
 /** Names the processor of the network, and the reason where it is not the first choice. */
@@ -89,13 +77,11 @@ function networkText({ processor, reason }) {
   return `The network ran on the processor${reason ? `: ${reason}` : ""}.`;
 }
 
-/** Takes files of a person; `taken`: of the device's camera, where more may follow. */
-function choose(list, taken = false) {
+function choose(list) {
   const files = [...list];
   if (files.length === 0) return;
-  // A single file is added to the one before, so that a phone can give them one by one, its camera any number.
-  const one = files.length === 1 && (photographs.length === 1 || taken);
-  const together = one ? [...photographs, ...files] : files;
+  // A single file is added to the one before, so that a phone can give them one by one.
+  const together = files.length === 1 && photographs.length === 1 ? [...photographs, ...files] : files;
   photographs = together.slice(0, PHOTOGRAPHS_MAX);
   const rows = photographs.map((file) => {
     const row = document.createElement("li"), picture = document.createElement("img");
@@ -111,15 +97,14 @@ function choose(list, taken = false) {
     ? `Only the first ${PHOTOGRAPHS_MAX} of ${together.length} photographs are used.` : null;
   showError(cut);
   if (photographs.length < 2) find("news").textContent = "One photograph chosen; choose another.";
-  else if (!taken) reconstruct();
-  else find("news").textContent = `${photographs.length} photographs: take another, or press “Reconstruct”.`;
+  else reconstruct();
 }
 
 function busy(state) {
   find("working").hidden = !state;
   find("cancel").hidden = !state;
   find("start").disabled = state || photographs.length < 2;
-  find("files").disabled = find("camera").disabled = state;
+  find("files").disabled = state;
 }
 
 /** Reads the photographs and returns the worker's answer. */
@@ -133,39 +118,9 @@ async function send(signal) {
     task: "reconstruct", module, files,
     options: {
       upscale: find("upscale").value, effort: find("effort").value,
-      size: ADDRESS.get("size") ?? "256", focal: find("focal").value, network: ADDRESS.get("network") ?? "auto",
+      size: ADDRESS.get("size") ?? "256", network: ADDRESS.get("network") ?? "auto",
     },
   }, files.map((f) => f.bytes));
-}
-
-async function attempt(work) {
-  try {
-    await work();
-  } catch (error) {
-    showError(error.message);
-  }
-}
-
-/** The scene as one page with the viewer: what `subsplat export -o scene.html` writes. */
-async function scenePage() {
-  const part = async (name) => {
-    const answer = await fetch(name);
-    if (!answer.ok) throw new Error(`${name} could not be loaded (${answer.status}).`);
-    return answer.text();
-  };
-  const [template, css, range, js] = await Promise.all(
-    ["scene.html", "viewer.css", "range.js", "viewer.js"].map(part));
-  const { spz, scene: { cameras, background } } = finished;
-  const url = await new Promise((done) => {
-    const reader = new FileReader();
-    reader.onload = () => done(reader.result);
-    reader.readAsDataURL(new Blob([spz]));
-  });
-  const parts = {
-    title: "scene", css, settings: JSON.stringify({ cameras, background }).replaceAll("<", "\\u003c"),
-    scene: url.slice(url.indexOf(",") + 1), js: range + js,
-  };
-  return new Blob([template.replace(/\{\{(\w+)\}\}/g, (_, name) => parts[name])], { type: "text/html" });
 }
 
 async function reconstruct() {
@@ -186,15 +141,11 @@ async function reconstruct() {
     find("result").hidden = false;
     viewer ??= new SplatViewer(find("viewer"), {
       draw: ADDRESS.get("draw") ?? "auto", levels: ADDRESS.get("levels") !== "off",
-      range: ADDRESS.get("range") !== "off", swing: ADDRESS.get("swing") !== "off",
     });
     await viewer.load(spz, scene);
-    finished = { spz, scene };
-    find("clip").hidden = !viewer.clipKind();
-    find("share").hidden = !canShare(new File([], "scene.html", { type: "text/html" }));
     const notes = scene.warnings.map((text) => {
       const row = document.createElement("li");
-      row.textContent = advised(text);
+      row.textContent = text;
       return row;
     });
     find("notes").hidden = notes.length === 0;
@@ -218,10 +169,6 @@ find("files").addEventListener("change", () => {
   // The same files can be chosen again.
   find("files").value = "";
 });
-find("camera").addEventListener("change", () => {
-  choose(find("camera").files, true);
-  find("camera").value = "";
-});
 find("cancel").addEventListener("click", () => {
   running.abort(new Error("Cancelled."));
   stopWorker("Cancelled.");
@@ -237,24 +184,6 @@ for (const button of document.querySelectorAll("[data-save]")) {
   });
 }
 find("picture").addEventListener("click", () => viewer.savePicture());
-find("page").addEventListener("click", () => attempt(async () => saveBlob(await scenePage(), "scene.html")));
-find("share").addEventListener("click", () => attempt(async () => {
-  const file = new File([await scenePage()], "scene.html", { type: "text/html" });
-  // Whoever closes the list of receivers shares nothing.
-  await navigator.share({ files: [file], title: "scene" }).catch(() => {});
-}));
-find("clip").addEventListener("click", () => attempt(async () => {
-  find("clip").disabled = true;
-  try {
-    const clip = await viewer.clip();
-    saveBlob(clip, `clip.${clip.type.includes("mp4") ? "mp4" : "webm"}`);
-  } finally {
-    find("clip").disabled = false;
-  }
-}));
-document.addEventListener("keydown", (event) => {
-  if (event.key === "Escape" && !event.defaultPrevented) find("notes").open = false;
-});
 const drop = find("drop");
 document.addEventListener("dragover", (event) => {
   event.preventDefault();

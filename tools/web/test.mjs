@@ -28,8 +28,8 @@ const browser = await chromium.launch({
 const subsplat = (...args) => execFileSync(SUBSPLAT, args, { stdio: ["ignore", "pipe", "inherit"] });
 
 /** A page whose errors fail the test, and which reports the addresses that it asks for. */
-async function open(url, { width = 480, height = 560, reducedMotion = "reduce" } = {}) {
-  const page = await browser.newPage({ viewport: { width, height }, reducedMotion });
+async function open(url, { width = 480, height = 560 } = {}) {
+  const page = await browser.newPage({ viewport: { width, height } });
   page.setDefaultTimeout(5 * MINUTES);
   const errors = [], asked = [];
   page.on("pageerror", (error) => errors.push(error.message));
@@ -97,30 +97,8 @@ async function native(scene, name, settings) {
 }
 
 const box = (page) => page.locator("canvas").boundingBox();
-/** Waits for the picture of a view that rests. */
-const idle = async (page) => {
-  await page.evaluate(() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))));
-  await page.waitForFunction(() => viewer.atRest);
-};
-/** How far the view is out of the photographs' range, also where it is not held there. */
-const excess = (page) => page.evaluate(
-  () => (viewer.range ?? ViewRange.of(viewer.scene, viewer.cameras)).excess(viewer.eye, viewer.forward()));
-/** Whether the view moves by itself. */
-async function moving(page) {
-  const eye = () => page.evaluate(() => viewer.eye.join());
-  const before = await eye();
-  await page.waitForTimeout(1000);
-  return before !== await eye();
-}
-/** A drag from the middle of the picture. */
-async function drag(page, right, down) {
-  const { x, y, width, height } = await box(page);
-  await page.mouse.move(x + width / 2, y + height / 2);
-  await page.mouse.down();
-  await page.mouse.move(x + width / 2 + right, y + height / 2 + down, { steps: 3 });
-  await page.mouse.up();
-  await idle(page);
-}
+const idle = (page) => page.evaluate(
+  () => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))));
 
 /** Drags in the scene; the picture must change. */
 async function moves(page, action, what) {
@@ -137,12 +115,8 @@ async function levelOfDetail(page, way) {
   const all = await page.evaluate(() => viewer.scene.count);
   await capture(page);
   const near = await page.evaluate(() => viewer.drawn);
-  // 16 times the distance, out of the range of views, where the picture would fade.
-  await page.evaluate(() => {
-    window.held = viewer.range;
-    viewer.range = null;
-    viewer.wheel(Math.log(16) / Math.log(0.9));
-  });
+  // 16 times the distance.
+  await page.evaluate(() => viewer.wheel(Math.log(16) / Math.log(0.9)));
   const fewer = await capture(page);
   // The page's canvas has another size than the captured picture, so its number is another one.
   await idle(page);
@@ -163,132 +137,12 @@ async function levelOfDetail(page, way) {
   // Without levels the far camera draws all.
   const off = await open(`${page.url().split("#")[0]}?levels=off#${way}`);
   await off.page.waitForFunction(() => viewer?.levels);
-  await off.page.evaluate(() => {
-    viewer.range = null;
-    viewer.wheel(Math.log(16) / Math.log(0.9));
-  });
+  await off.page.evaluate(() => viewer.wheel(Math.log(16) / Math.log(0.9)));
   await capture(off.page);
   assert.equal(await off.page.evaluate(() => viewer.drawn), all, "levels=off");
   await off.page.close();
-  await page.evaluate(() => {
-    viewer.range = held;
-    viewer.reset();
-  });
+  await page.evaluate(() => viewer.reset());
   await idle(page);
-}
-
-/** Views stay where the photographs support them, softly, except when flying. */
-async function rangeOfViews(url) {
-  const { page, errors } = await open(url);
-  await page.waitForFunction(() => viewer?.levels);
-  assert.ok(await excess(page) < 1e-3, "a photograph's place");
-  const reach = await page.evaluate(() => viewer.range.sites.map((site) => site.reach.map((r) => r * 180 / Math.PI)));
-  assert.ok(reach.flat().every((r) => r >= 4 && r <= 25) && reach.flat().some((r) => r > 4.1), `${reach}`);
-  await drag(page, 100, 0);
-  const once = await excess(page);
-  assert.ok(once > 0.1 && once < 0.95, `a drag of 100 px: ${once}`);
-  for (let k = 0; k < 8; k++) await drag(page, 200, -150);
-  const limit = await excess(page);
-  assert.ok(limit > 0.9 && limit < 1.05, `many drags: ${limit}`);
-  const inside = await capture(page);
-  for (const [keys, what] of [["-", "farther"], ["+", "nearer"]]) {
-    await page.click("text=Reset");
-    for (let k = 0; k < 12; k++) await page.locator("canvas").press(keys);
-    await idle(page);
-    const end = await excess(page);
-    assert.ok(end > 0.5 && end < 1.05, `${what}: ${end}`);
-  }
-  // The way back is free: after the limit one drag of 100 px comes nearer to the photograph.
-  await page.click("text=Reset");
-  for (let k = 0; k < 8; k++) await drag(page, -200, 0);
-  await drag(page, 100, 0);
-  assert.ok(await excess(page) < 0.7, "the way back");
-  // Flying leaves the range, and the picture fades to the background there.
-  await page.click("text=Reset");
-  await page.click("text=Fly");
-  await drag(page, 220, 0);
-  assert.ok(await excess(page) > 1.5, "flying is free");
-  const faded = await capture(page);
-  const plain = await page.evaluate(() => {
-    window.held = viewer.range;
-    viewer.range = null;
-  }).then(() => capture(page));
-  assert.ok(psnr(faded, plain) < 35, "views outside the range fade");
-  await page.evaluate(() => { viewer.range = held; });
-  assert.equal(errors.length, 0, errors.join());
-  await page.close();
-  // Without the range the same drags lead far out of it.
-  const off = await open(url.replace("#", "?range=off#"));
-  await off.page.waitForFunction(() => viewer?.levels);
-  assert.equal(await off.page.evaluate(() => viewer.range), null);
-  for (let k = 0; k < 8; k++) await drag(off.page, 200, -150);
-  assert.ok(await excess(off.page) > 2, "range=off");
-  await off.page.close();
-  return inside;
-}
-
-/** The view swings until somebody touches it, and not for people who ask for less motion. */
-async function swings(url) {
-  const touches = {
-    click: (page) => drag(page, 0, 0), wheel: (page) => page.mouse.wheel(0, 10),
-    key: (page) => page.locator("canvas").press("x"), button: (page) => page.click("text=Keys"),
-  };
-  for (const [name, touch] of Object.entries(touches)) {
-    const { page, errors } = await open(url, { width: 200, height: 340, reducedMotion: "no-preference" });
-    await page.waitForFunction(() => viewer?.swinging);
-    assert.ok(await moving(page), "the view swings");
-    assert.ok(await excess(page) < 1, "the swing stays in the range");
-    const { x, y } = await box(page);
-    await page.mouse.move(x + 20, y + 20);
-    await touch(page);
-    await idle(page);
-    assert.ok(!await moving(page), `the swing ends with a touch: ${name}`);
-    assert.equal(errors.length, 0, errors.join());
-    await page.close();
-  }
-  for (const [address, reducedMotion] of [[url, "reduce"], [url.replace("#", "?swing=off#"), "no-preference"]]) {
-    const { page } = await open(address, { width: 200, height: 340, reducedMotion });
-    await page.waitForFunction(() => viewer?.levels);
-    assert.ok(!await moving(page), `no swing: ${address}, ${reducedMotion}`);
-    await page.close();
-  }
-}
-
-/** The keys' list closes with Escape, from the canvas and from its button. */
-async function escapes(page) {
-  for (const [open, from] of [["KeyH", "canvas"], ["Enter", "[data-do=help]"]]) {
-    await page.locator(from).press(open);
-    assert.ok(await page.isVisible(".splat-keys"));
-    assert.equal(await page.getAttribute("[data-do=help]", "aria-expanded"), "true");
-    await page.locator(from).press("Escape");
-    assert.ok(await page.isHidden(".splat-keys"), `Escape closes the keys, from ${from}`);
-    assert.equal(await page.getAttribute("[data-do=help]", "aria-expanded"), "false");
-  }
-}
-
-/** The saved picture is what the screen frames, at twice its size. */
-async function savesPicture(page) {
-  await idle(page);
-  const event = page.waitForEvent("download");
-  await page.click("text=Save picture");
-  assert.equal((await event).suggestedFilename(), "view.png");
-  await (await event).saveAs(`${PLACE}/view.png`);
-  const saved = await picture(`${PLACE}/view.png`);
-  const { width, height } = await box(page);
-  assert.deepEqual([saved.width, saved.height], [2 * Math.floor(width), 2 * Math.floor(height)]);
-  // Means of four pixels, against the picture on the screen.
-  await idle(page);
-  fs.writeFileSync(`${PLACE}/screen.png`, await page.locator("canvas").screenshot());
-  const screen = await picture(`${PLACE}/screen.png`);
-  const half = Buffer.alloc(screen.rgba.length);
-  for (let at = 0; at < half.length; at++) {
-    const x = (at >> 2) % screen.width, y = Math.floor((at >> 2) / screen.width);
-    const from = (i, j) => saved.rgba[4 * ((2 * y + j) * saved.width + 2 * x + i) + at % 4];
-    half[at] = (from(0, 0) + from(1, 0) + from(0, 1) + from(1, 1)) / 4;
-  }
-  const likeness = psnr({ ...screen, rgba: half }, screen);
-  console.log(`export: saved picture ${likeness.toFixed(1)} dB against the screen`);
-  assert.ok(likeness > 28);
 }
 
 async function testExport() {
@@ -303,30 +157,9 @@ async function testExport() {
   await page.waitForFunction(() => document.querySelector(".splat-status").textContent);
   assert.equal(await page.title(), title);
   assert.equal(errors.length, 0, errors.join());
-  // The photographs' own places, not those of cameras.json beside the scene, which is of rendered views.
-  const names = ["input_0", "input_1"];
-  assert.deepEqual(await page.evaluate(() => viewer.cameras.map((c) => c.name)), names);
+  assert.equal(await page.evaluate(() => viewer.cameras.length), 3, "cameras.json beside the scene");
   assert.equal(asked.length, 1, `asked for ${asked.join()}`);
   await page.close();
-  subsplat("export", `${out}/${title}.ply`, "--cameras", `${out}/cameras.json`, "-o", `${out}/views.html`);
-  const views = await open(pathToFileURL(path.resolve(`${out}/views.html`)).href);
-  await views.page.click("text=Next view");
-  assert.match(await views.page.textContent(".splat-status"), /^View 2 of 3/);
-  // WebGL is software in this browser.
-  assert.equal(await views.page.evaluate(() => viewer.painter.name), "the processor");
-  await views.page.close();
-
-  const shown = pathToFileURL(path.resolve(`${out}/scene.html`)).href;
-  // Few Gaussians, which a browser without a graphics card draws in time.
-  subsplat("export", `${out}/scene.ply`, "--gaussians", "2000", "-o", `${out}/few.html`);
-  for (const way of ["webgl", "cpu"]) {
-    await swings(`${pathToFileURL(path.resolve(`${out}/few.html`)).href}#${way}`);
-  }
-  const limits = {};
-  for (const way of ["webgl", "cpu"]) limits[way] = await rangeOfViews(`${shown}#${way}`);
-  const alike = psnr(limits.webgl, limits.cpu);
-  console.log(`export: at the limit, with filled holes, ${alike.toFixed(1)} dB between WebGL2 and the processor`);
-  assert.ok(alike > LIKENESS, "both ways fill holes alike");
 
   for (const way of ["webgl", "cpu"]) {
     const url = `${pathToFileURL(path.resolve(`${out}/scene.html`)).href}#${way}`;
@@ -366,9 +199,7 @@ async function testExport() {
     await page.mouse.move(...middle);
     await moves(page, () => page.mouse.wheel(0, -300), "the wheel");
     await moves(page, () => page.locator("canvas").press("ArrowRight"), "an arrow key");
-    await moves(page, () => page.click("text=Next photo"), "Next photo");
-    assert.equal(await page.textContent(".splat-status"), "Photograph 2 of 2: input_1");
-    await escapes(page);
+    await moves(page, () => page.click("text=Next view"), "Next view");
     await page.click("text=Fly");
     assert.equal(await page.getAttribute("text=Fly", "aria-pressed"), "true");
     await moves(page, async () => {
@@ -377,8 +208,9 @@ async function testExport() {
       await page.waitForTimeout(300);
       await page.keyboard.up("KeyW");
     }, "W");
-    await page.click("text=Reset");
-    await savesPicture(page);
+    const saved = page.waitForEvent("download");
+    await page.click("text=Save picture");
+    assert.equal((await saved).suggestedFilename(), "view.png");
     assert.equal(errors.length, 0, errors.join());
     if (way === "webgl") {
       await page.setViewportSize({ width: 360, height: 640 });

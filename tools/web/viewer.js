@@ -1,7 +1,7 @@
 // The viewer: Gaussians in a canvas, by WebGL2, or on the CPU where the browser has none.
 //
-// Classic scripts without imports, because a page opened from file:// may load no module: this one, and range.js
-// before it. The page (index.html) and every exported scene (scene.html) contain both.
+// One classic script without imports, because a page opened from file:// may load no module. The
+// page (index.html) and every exported scene (scene.html) contain it.
 //
 // World axes here are those of .spz: x right, y up, z backward. Camera axes are OpenCV's: x right,
 // y down, z forward. Projection, low-pass and blending are the crate's `standard` convention
@@ -170,17 +170,17 @@ function toViewer(camera) {
     for (let c = 0; c < 3; c++) rotation.push(signs[r] * m[4 * r + c]);
     eye.push(signs[r] * m[4 * r + 3]);
   }
-  const { width, height, fx, fy, cx, cy, name } = camera;
-  return { width, height, fx, fy, cx, cy, rotation, eye, name };
+  const { width, height, fx, fy, cx, cy } = camera;
+  return { width, height, fx, fy, cx, cy, rotation, eye };
 }
 
-/** Camera z of every `step`-th mean in front of `camera`, sorted. */
-function depths(scene, camera, step = 1) {
+/** Camera z of all means in front of `camera`, sorted. */
+function depths(scene, camera) {
   const forward = column(camera.rotation, 2);
   const offset = dot(forward, camera.eye);
-  const z = new Float32Array(Math.ceil(scene.count / step));
+  const z = new Float32Array(scene.count);
   let n = 0;
-  for (let i = 0; i < scene.count; i += step) {
+  for (let i = 0; i < scene.count; i++) {
     const v = dot(forward, scene.means.subarray(3 * i, 3 * i + 3)) - offset;
     if (v > 0) z[n++] = v;
   }
@@ -604,44 +604,18 @@ void main() {
 const COPY_FRAGMENT = `#version 300 es
 precision highp float;
 uniform highp sampler2D picture;
-uniform vec3 background;
-uniform float levels, fade;
 out vec4 result;
 void main() {
-  vec4 own = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
-  vec2 size = vec2(textureSize(picture, 0)), at = gl_FragCoord.xy / size;
-  vec3 fill = background;
-  if (own.a < 0.998) {
-    for (float level = levels; level > 0.5; level -= 1.0) {
-      vec2 d = 0.5 * exp2(level) / size;
-      vec4 sum = 0.25 * (textureLod(picture, at + d, level) + textureLod(picture, at - d, level)
-        + textureLod(picture, at + vec2(d.x, -d.y), level) + textureLod(picture, at + vec2(-d.x, d.y), level));
-      fill = sum.rgb + (1.0 - sum.a) * fill;
-    }
-  }
-  vec3 rgb = own.rgb + (1.0 - own.a) * fill;
-  vec2 middle = 2.0 * at - 1.0;
-  result = vec4(mix(rgb, background, fade * min(0.25 + dot(middle, middle), 1.0)), 1.0);
+  result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1.0);
 }`;
 
-/** Names of drivers that draw WebGL on the processor. */
-const SOFTWARE = /swiftshader|llvmpipe|softpipe|swrast|software|basic render/i;
-
-/**
- * Draws by WebGL2: instanced quads, farthest first, into half floats where the browser can. Where nothing covers a
- * pixel, its surroundings fill it: the same picture at half the size, a quarter and so on.
- */
+/** Draws by WebGL2: instanced quads, farthest first, into half floats where the browser can. */
 class GlPainter {
-  /** `hardware` refuses a driver that draws on the processor, where `CpuPainter` is faster. */
-  constructor(canvas, hardware) {
+  constructor(canvas) {
     const gl = canvas.getContext("webgl2", {
       alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true,
-      failIfMajorPerformanceCaveat: hardware,
     });
     if (!gl) throw new Error("This browser has no WebGL2.");
-    const names = gl.getExtension("WEBGL_debug_renderer_info");
-    const driver = gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-    if (hardware && SOFTWARE.test(driver)) throw new Error(`${driver} draws on the processor.`);
     this.gl = gl;
     this.canvas = canvas;
     this.half = Boolean(
@@ -662,12 +636,6 @@ class GlPainter {
 
   get name() {
     return "WebGL2";
-  }
-
-  /** Longest side of a picture, px. */
-  get sideMax() {
-    const { gl } = this;
-    return Math.min(gl.getParameter(gl.MAX_TEXTURE_SIZE), ...gl.getParameter(gl.MAX_VIEWPORT_DIMS));
   }
 
   program(vertex, fragment) {
@@ -778,11 +746,9 @@ class GlPainter {
       this.picture = gl.createTexture();
       gl.activeTexture(gl.TEXTURE2);
       gl.bindTexture(gl.TEXTURE_2D, this.picture);
-      this.halves = Math.floor(Math.log2(Math.max(width, height)));
-      gl.texStorage2D(gl.TEXTURE_2D, this.halves + 1, gl.RGBA16F, width, height);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_NEAREST);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
       this.frame = gl.createFramebuffer();
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
       gl.framebufferTexture2D(
@@ -793,8 +759,7 @@ class GlPainter {
     return this.half ? this.frame : null;
   }
 
-  /** Draws `chosen` Gaussians, or all; `fade` of 1 leaves the background's colour only, first at the edges. */
-  draw(view, background, chosen, fade = 0) {
+  draw(view, background, chosen) {
     const { gl, splats } = this;
     const n = this.sorter.sort(this.scene, view, chosen);
     const order = this.sorter.order.subarray(0, n).reverse();
@@ -802,8 +767,7 @@ class GlPainter {
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target(view.width, view.height));
     gl.viewport(0, 0, view.width, view.height);
-    if (this.half) gl.clearColor(0, 0, 0, 0);
-    else gl.clearColor(...background, 1);
+    gl.clearColor(...background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(splats);
     const at = (name) => gl.getUniformLocation(splats, name);
@@ -831,14 +795,9 @@ class GlPainter {
       gl.disable(gl.BLEND);
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
       gl.useProgram(this.copy);
-      const of = (name) => gl.getUniformLocation(this.copy, name);
-      gl.uniform1i(of("picture"), 2);
-      gl.uniform3f(of("background"), ...background);
-      gl.uniform1f(of("levels"), this.halves);
-      gl.uniform1f(of("fade"), fade);
+      gl.uniform1i(gl.getUniformLocation(this.copy, "picture"), 2);
       gl.activeTexture(gl.TEXTURE2);
       gl.bindTexture(gl.TEXTURE_2D, this.picture);
-      gl.generateMipmap(gl.TEXTURE_2D);
       gl.bindVertexArray(this.empty);
       gl.drawArrays(gl.TRIANGLE_STRIP, 0, 3);
     }
@@ -870,11 +829,6 @@ class CpuPainter {
     return "the processor";
   }
 
-  /** Longest side of a picture, px: that of a canvas in common browsers. */
-  get sideMax() {
-    return 8192;
-  }
-
   load(scene) {
     this.scene = scene;
     this.sorter = new Sorter(scene.count);
@@ -904,7 +858,7 @@ class CpuPainter {
     }
   }
 
-  draw(view, background, chosen, fade = 0) {
+  draw(view, background, chosen) {
     const { means, covariances, opacities } = this.scene;
     const { width, height, rotation: r, eye, fx, fy, limit, lowpass } = view;
     const n = this.sorter.sort(this.scene, view, chosen);
@@ -967,13 +921,10 @@ class CpuPainter {
       }
     }
     const image = this.context.createImageData(width, height);
-    const fill = filled(sums, through, width, height, background);
     for (let at = 0; at < width * height; at++) {
-      const x = (2 * (at % width) + 1) / width - 1, y = (2 * Math.floor(at / width) + 1) / height - 1;
-      const faded = fade * Math.min(0.25 + x * x + y * y, 1);
       for (let c = 0; c < 3; c++) {
-        const own = sums[3 * at + c] + through[at] * fill[3 * at + c];
-        image.data[4 * at + c] = Math.round(255 * (own + faded * (background[c] - own)));
+        image.data[4 * at + c] = Math.round(
+          255 * (sums[3 * at + c] + through[at] * background[c]));
       }
       image.data[4 * at + 3] = 255;
     }
@@ -985,76 +936,24 @@ class CpuPainter {
   }
 }
 
-/** Colours that fill a picture where little covers it: the surroundings, from the picture at half the size on. */
-function filled(sums, through, width, height, background) {
-  const w = Math.ceil(width / 2), h = Math.ceil(height / 2);
-  const halfSums = new Float32Array(3 * w * h), halfThrough = new Float32Array(w * h);
-  for (let y = 0; y < h; y++) {
-    for (let x = 0; x < w; x++) {
-      const to = y * w + x;
-      for (let k = 0; k < 4; k++) {
-        const at = Math.min(2 * y + (k >> 1), height - 1) * width + Math.min(2 * x + (k & 1), width - 1);
-        halfThrough[to] += 0.25 * through[at];
-        for (let c = 0; c < 3; c++) halfSums[3 * to + c] += 0.25 * sums[3 * at + c];
-      }
-    }
-  }
-  const under = w * h > 1 ? filled(halfSums, halfThrough, w, h, background) : background;
-  for (let at = 0; at < 3 * w * h; at++) halfSums[at] += halfThrough[Math.floor(at / 3)] * under[at];
-  const out = new Float32Array(3 * width * height);
-  for (let y = 0; y < height; y++) {
-    const v = Math.min(Math.max(0.5 * y - 0.25, 0), h - 1), y0 = Math.floor(v), y1 = Math.min(y0 + 1, h - 1);
-    for (let x = 0; x < width; x++) {
-      if (through[y * width + x] < 0.002) continue;
-      const u = Math.min(Math.max(0.5 * x - 0.25, 0), w - 1), x0 = Math.floor(u), x1 = Math.min(x0 + 1, w - 1);
-      for (let c = 0; c < 3; c++) {
-        const of = (column, row) => halfSums[3 * (row * w + column) + c];
-        const above = of(x0, y0) + (u - x0) * (of(x1, y0) - of(x0, y0));
-        const below = of(x0, y1) + (u - x0) * (of(x1, y1) - of(x0, y1));
-        out[3 * (y * width + x) + c] = above + (v - y0) * (below - above);
-      }
-    }
-  }
-  return out;
-}
-
 const KEYS = [
   ["Drag, or arrow keys", "rotate"],
   ["Right or Shift drag, two fingers, or Shift arrows", "shift"],
   ["Wheel, pinch, + and −", "nearer and farther; when flying: faster and slower"],
   ["W A S D, E Q", "move forward, left, back, right, up, down"],
-  ["F", "fly: leave the range of good views; or orbit within it"],
+  ["F", "orbit or fly"],
   ["V", "next photograph’s place"],
   ["R", "back to the start"],
   ["L", "all Gaussians, or fewer where they are far"],
-  ["P", "save the picture as you see it, at twice the size"],
-  ["Escape", "close this list"],
+  ["P", "save the picture"],
 ];
-
-/** Excess of the range of views from which on a movement out of it slows down. */
-const SOFT = 0.6;
-/** Part of the reach that a drag of 100 px turns by. */
-const DRAG_REACH = 0.8;
-/** Seconds of a swing, its part of the least reach, and how much it rises of what it turns. */
-const SWING_SECONDS = 10, SWING_REACH = 0.6, SWING_RISE = 0.25;
-/** Time of a picture above which it is drawn smaller on the processor while the view moves, and does not swing, ms. */
-const SLOW = 100;
-/** Largest part of the background's colour in views outside the range. */
-const FADE_MAX = 0.7;
-/** Most pixels of a saved picture. */
-const PICTURE_MAX = 24e6;
 
 /** A viewer inside the element `root`. */
 class SplatViewer {
-  /**
-   * `draw`: "auto", "webgl" or "cpu"; `levels`: whether far parts are drawn with fewer Gaussians; `range`: whether
-   * views stay where the photographs support them; `swing`: whether the view moves until somebody touches it.
-   */
-  constructor(root, { draw = "auto", levels = true, range = true, swing = true } = {}) {
+  /** `draw`: "auto", "webgl" or "cpu"; `levels`: whether far parts are drawn with fewer Gaussians. */
+  constructor(root, { draw = "auto", levels = true } = {}) {
     this.root = root;
     this.useLevels = levels;
-    this.useRange = range;
-    this.useSwing = swing;
     root.classList.add("splat-viewer");
     root.innerHTML = `
       <canvas tabindex="0" role="application" aria-roledescription="3D view"
@@ -1066,7 +965,6 @@ class SplatViewer {
         <button type="button" data-do="view">Next view</button>
         <button type="button" data-do="reset">Reset</button>
         <button type="button" data-do="picture">Save picture</button>
-        <button type="button" data-do="share" hidden>Share</button>
         <button type="button" data-do="help" aria-expanded="false">Keys</button>
       </div>
       <dl class="splat-keys" hidden></dl>
@@ -1082,7 +980,7 @@ class SplatViewer {
     this.painter = null;
     if (draw !== "cpu") {
       try {
-        this.painter = new GlPainter(this.canvas, draw === "auto");
+        this.painter = new GlPainter(this.canvas);
       } catch (error) {
         if (draw === "webgl") throw error;
         // A canvas keeps its first context.
@@ -1092,11 +990,8 @@ class SplatViewer {
       }
     }
     this.painter ??= new CpuPainter(this.canvas);
-    this.button("share").hidden = !canShare(new File([], "view.png", { type: "image/png" }));
     this.held = new Set();
     this.pointers = new Map();
-    /** Size of a picture while the view moves, of its full size. */
-    this.draft = this.painter instanceof GlPainter ? 1 : 0.25;
     this.listen();
   }
 
@@ -1104,13 +999,9 @@ class SplatViewer {
     this.status.textContent = text;
   }
 
-  button(name) {
-    return this.root.querySelector(`[data-do=${name}]`);
-  }
-
   /**
-   * Shows a scene. `spz`: the file's bytes; `settings`: `cameras` (of cameras.json, one object each, with a `name`
-   * where there is one), `photographs` (false where the cameras are of other views), `background`, `near`, `lowpass`.
+   * Shows a scene. `spz`: the file's bytes; `settings`: `cameras` (of cameras.json, one object
+   * each), `background`, `near`, `lowpass`.
    */
   async load(spz, settings = {}) {
     const scene = await parseSpz(spz);
@@ -1122,73 +1013,19 @@ class SplatViewer {
     const box = bounds(scene);
     const cameras = (settings.cameras ?? []).map(toViewer);
     this.cameras = cameras.length ? cameras : [wholeCamera(box)];
-    this.place = settings.photographs === false ? "View" : "Photograph";
-    this.button("view").textContent = `Next ${settings.photographs === false ? "view" : "photo"}`;
     const up = cameras.reduce((sum, c) => add(sum, column(c.rotation, 1), -1), [0, 0, 0]);
     this.up = unit(up) ?? [0, 1, 0];
     this.radius = Math.max(0.5 * Math.hypot(...add(box[1], box[0], -1)), 1e-3);
     this.view = 0;
     this.fly = false;
-    this.button("fly").setAttribute("aria-pressed", "false");
-    this.button("view").hidden = this.cameras.length < 2;
+    this.root.querySelector("[data-do=fly]").setAttribute("aria-pressed", "false");
+    this.root.querySelector("[data-do=view]").hidden = this.cameras.length < 2;
     this.levels = null;
-    this.swinging = null;
-    this.touched = false;
-    this.range = this.useRange ? ViewRange.of(scene, cameras) : null;
     this.reset();
     this.drawn = scene.count;
     this.sayCount();
-    // The range is measured and the levels are made after the first picture.
-    setTimeout(() => this.prepare(scene).catch(() => { this.levels = null; }), 100);
-  }
-
-  /** Measures the range of views, begins the swing and makes the levels, until another scene is loaded. */
-  async prepare(scene) {
-    const pause = slices(() => this.scene === scene);
-    if (this.range && await this.range.measure(pause)) this.swing();
-    await this.makeLevels(scene);
-  }
-
-  /** Moves the view gently about where it is, until somebody touches it: unasked only where pictures are quick. */
-  swing(asked = false) {
-    const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
-    if (!asked && (this.touched || !this.useSwing || still || this.cost > SLOW)) return;
-    const { rotation, distance } = this, eye = this.eye, pivot = this.pivot();
-    const size = SWING_REACH * Math.min(...this.range.nearest(eye).reach);
-    const swing = this.swinging = { frames: 0, since: null };
-    let begin = null;
-    const frame = (now) => {
-      if (this.swinging !== swing) return;
-      begin ??= now;
-      swing.since ??= now;
-      // Frames come unevenly where the graphics card is behind: those of the time of ten slow ones count.
-      swing.frames++;
-      if (now - swing.since > 10 * SLOW) {
-        if (!asked && swing.frames < 10) {
-          this.swinging = null;
-          Object.assign(this, { rotation, eye });
-          this.redraw();
-          return;
-        }
-        Object.assign(swing, { frames: 0, since: now });
-      }
-      const seconds = (now - begin) / 1000, turn = 2 * Math.PI * seconds / SWING_SECONDS;
-      const wide = size * Math.min(seconds / 3, 1);
-      const turned = multiply(about(this.up, wide * Math.sin(turn)), rotation);
-      this.rotation = orthonormal(multiply(turned, about([1, 0, 0], SWING_RISE * wide * Math.sin(2 * turn))));
-      this.eye = add(pivot, this.forward(), -distance);
-      this.paint();
-      requestAnimationFrame(frame);
-    };
-    requestAnimationFrame(frame);
-  }
-
-  /** Ends the swing where it is. */
-  touch() {
-    this.touched = true;
-    if (!this.swinging) return;
-    this.swinging = null;
-    this.redraw();
+    // The levels are made after the first picture.
+    setTimeout(() => this.makeLevels(scene).catch(() => { this.levels = null; }), 100);
   }
 
   /** Says the number of Gaussians drawn. */
@@ -1205,12 +1042,6 @@ class SplatViewer {
     if (!levels || !await this.painter.extend(levels.scene, pause)) return;
     this.levels = levels;
     this.redraw();
-  }
-
-  /** Says which photograph's place the view has. */
-  sayPlace() {
-    const name = this.home.name ? `: ${this.home.name}` : "";
-    this.say(`${this.place} ${this.view + 1} of ${this.cameras.length}${name}`);
   }
 
   /** Goes to the place of a photograph. */
@@ -1234,48 +1065,24 @@ class SplatViewer {
     return add(this.eye, this.forward(), this.distance);
   }
 
-  /** Does a movement in parts; each of them is shorter where it leads out of the range of views. */
-  within(parts, move) {
-    const count = Math.min(Math.max(1, Math.ceil(parts)), 64), { range } = this;
-    for (let k = 0; k < count; k++) {
-      const { eye, rotation, distance } = this;
-      const before = range && !this.fly ? range.excess(eye, this.forward()) : 0;
-      move(1 / count);
-      if (!range || this.fly) continue;
-      const after = range.excess(this.eye, this.forward());
-      if (after <= before || after <= SOFT) continue;
-      Object.assign(this, { eye, rotation, distance });
-      const share = Math.min((1 - before) / (1 - SOFT), 1);
-      if (share > 0) move(share / count);
-    }
-    this.redraw();
-  }
-
   /** Rotates by a drag, px of a picture `height` px high. */
   rotate(x, y, height = this.canvas.clientHeight) {
-    let scale = Math.PI / height;
-    if (this.range && !this.fly) scale = Math.min(scale, DRAG_REACH / 100 * this.range.reach(this.eye));
-    this.within(Math.abs(x) / 16, (part) => this.turn(-scale * x * part, 0));
-    this.within(Math.abs(y) / 16, (part) => this.turn(0, -scale * y * part));
-  }
-
-  /** Turns about the world's up and raises the view, radians; about the eye when flying. */
-  turn(side, rise) {
     const pivot = this.pivot();
+    const scale = Math.PI / height;
     const elevation = Math.asin(Math.min(Math.max(dot(this.forward(), this.up), -1), 1));
     const limit = Math.max(89 * Math.PI / 180, Math.abs(elevation));
-    const raised = Math.min(Math.max(elevation + rise, -limit), limit) - elevation;
-    const turned = multiply(about(this.up, side), this.rotation);
+    const raised = Math.min(Math.max(elevation - scale * y, -limit), limit) - elevation;
+    const turned = multiply(about(this.up, -scale * x), this.rotation);
     this.rotation = orthonormal(multiply(turned, about([1, 0, 0], raised)));
     if (!this.fly) this.eye = add(pivot, this.forward(), -this.distance);
+    this.redraw();
   }
 
   pan(x, y) {
     const k = fitted(this.home, this.canvas.clientWidth, this.canvas.clientHeight);
-    for (const along of [[x / k.fx, 0, 0], [0, y / k.fy, 0]]) {
-      const shift = apply(this.rotation, along);
-      this.within(Math.hypot(...along) / 0.02, (part) => { this.eye = add(this.eye, shift, -this.distance * part); });
-    }
+    const shift = apply(this.rotation, [x / k.fx, y / k.fy, 0]);
+    this.eye = add(this.eye, shift, -this.distance);
+    this.redraw();
   }
 
   /** Steps of the wheel, positive nearer or faster. */
@@ -1285,60 +1092,41 @@ class SplatViewer {
       this.speed = within(this.speed * 1.25 ** steps);
       return;
     }
-    this.within(2 * Math.abs(steps), (part) => {
-      const pivot = this.pivot();
-      this.distance = within(this.distance * 0.9 ** (steps * part));
-      this.eye = add(pivot, this.forward(), -this.distance);
-    });
+    const pivot = this.pivot();
+    this.distance = within(this.distance * 0.9 ** steps);
+    this.eye = add(pivot, this.forward(), -this.distance);
+    this.redraw();
   }
 
   move([right, up, forward], seconds) {
-    const ways = [[right, 0, 0], [0, 0, forward]].map((way) => apply(this.rotation, way));
-    ways.push(this.up.map((v) => up * v));
-    const length = Math.max(1, Math.hypot(...ways.reduce((sum, way) => add(sum, way))));
-    const far = this.speed * seconds / length;
-    for (const way of ways) {
-      const parts = far * Math.hypot(...way) / (0.02 * this.distance);
-      if (parts > 0) this.within(parts, (part) => { this.eye = add(this.eye, way, far * part); });
-    }
+    let along = add(apply(this.rotation, [right, 0, forward]), this.up, up);
+    const length = Math.hypot(...along);
+    if (length > 1) along = along.map((c) => c / length);
+    this.eye = add(this.eye, along, this.speed * seconds);
+    this.redraw();
   }
 
   redraw() {
     if (this.pending || !this.scene) return;
     this.pending = true;
-    this.atRest = false;
     requestAnimationFrame(() => {
       this.pending = false;
-      this.paint(this.draft);
-      // The full size, at rest. The number is said at rest too, and replaces no other message.
+      this.paint();
+      // The number is said at rest, and replaces no other message.
       clearTimeout(this.counting);
-      this.counting = setTimeout(() => this.rest(), 300);
+      this.counting = setTimeout(() => {
+        if (this.status.textContent === this.countText) this.sayCount();
+      }, 300);
     });
   }
 
-  /** Draws the picture of a view that rests. */
-  rest() {
-    if (this.draft < 1) this.paint();
-    this.atRest = true;
-    if (this.status.textContent === this.countText) this.sayCount();
-  }
-
-  /** Draws the view; `part` of its size makes a picture quicker. */
-  paint(part = 1) {
-    const hardware = this.painter instanceof GlPainter;
-    const ratio = part * (hardware ? Math.min(window.devicePixelRatio || 1, 2) : 1);
+  paint() {
+    const ratio = this.painter instanceof GlPainter ? Math.min(window.devicePixelRatio || 1, 2) : 1;
     const width = Math.max(1, Math.round(ratio * this.canvas.clientWidth));
     const height = Math.max(1, Math.round(ratio * this.canvas.clientHeight));
-    const begin = performance.now();
     this.paintAt(fitted(this.home, width, height));
-    const spent = performance.now() - begin;
-    if (part === 1) this.cost = spent;
-    if (!hardware && part === this.draft) {
-      this.draft = Math.min(Math.max(part * Math.sqrt(SLOW / spent), 0.15), 1);
-    }
   }
 
-  /** Draws the view at a size, px; it fades outside the range of views. */
   paintAt(intrinsics) {
     const { width, height } = intrinsics;
     if (this.canvas.width !== width) this.canvas.width = width;
@@ -1346,8 +1134,7 @@ class SplatViewer {
     const camera = { ...intrinsics, rotation: this.rotation, eye: this.eye };
     const view = projection(camera, this.rules);
     const chosen = this.useLevels && this.levels ? this.levels.select(view) : null;
-    const excess = this.range ? this.range.excess(this.eye, this.forward()) : 0;
-    this.painter.draw(view, this.background, chosen, FADE_MAX * Math.min(Math.max((excess - 1) / 2, 0), 1));
+    this.painter.draw(view, this.background, chosen);
     this.drawn = chosen ? chosen.length : this.scene.count;
   }
 
@@ -1360,77 +1147,28 @@ class SplatViewer {
     return data;
   }
 
-  /** The view as the screen frames it at `times` its size, as a PNG. */
-  picture(times = 2) {
-    const { clientWidth, clientHeight } = this.canvas;
-    let ratio = times * Math.min(window.devicePixelRatio || 1, 2);
-    ratio = Math.min(ratio, Math.sqrt(PICTURE_MAX / (clientWidth * clientHeight)),
-      this.painter.sideMax / Math.max(clientWidth, clientHeight));
-    const [width, height] = [clientWidth, clientHeight].map((side) => Math.floor(ratio * side));
-    this.paintAt(fitted(this.home, width, height));
+  savePicture() {
+    const data = this.capture();
     const canvas = document.createElement("canvas");
-    [canvas.width, canvas.height] = [width, height];
-    canvas.getContext("2d").putImageData(
-      new ImageData(new Uint8ClampedArray(this.painter.pixels(width, height)), width), 0, 0);
-    this.redraw();
-    return new Promise((done) => canvas.toBlob(done, "image/png"));
-  }
-
-  async savePicture() {
-    saveBlob(await this.picture(), "view.png");
-  }
-
-  /** The kind of clip that the browser records, or nothing. */
-  clipKind() {
-    const kinds = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
-    const can = window.MediaRecorder && this.canvas.captureStream && this.range;
-    return can ? kinds.find((kind) => MediaRecorder.isTypeSupported(kind)) : undefined;
-  }
-
-  /** Records one swing about the view as it is, in the time that it takes. */
-  async clip(seconds = SWING_SECONDS) {
-    this.touch();
-    const stream = this.canvas.captureStream(30), parts = [];
-    const recorder = new MediaRecorder(stream, { mimeType: this.clipKind(), videoBitsPerSecond: 12e6 });
-    recorder.ondataavailable = ({ data }) => parts.push(data);
-    const stopped = new Promise((done) => { recorder.onstop = done; });
-    this.say(`Recording ${seconds} seconds …`);
-    recorder.start();
-    const { rotation, eye } = this;
-    this.swing(true);
-    await new Promise((done) => setTimeout(done, 1000 * seconds));
-    this.touch();
-    Object.assign(this, { rotation, eye });
-    recorder.stop();
-    await stopped;
-    stream.getTracks().forEach((track) => track.stop());
-    this.sayCount();
-    this.redraw();
-    return new Blob(parts, { type: recorder.mimeType });
-  }
-
-  async share() {
-    const file = new File([await this.picture()], "view.png", { type: "image/png" });
-    // Whoever closes the list of receivers shares nothing.
-    await navigator.share({ files: [file], title: document.title }).catch(() => {});
+    [canvas.width, canvas.height] = [data.width, data.height];
+    canvas.getContext("2d").putImageData(data, 0, 0);
+    canvas.toBlob((blob) => saveBlob(blob, "view.png"), "image/png");
   }
 
   act(name) {
     if (!this.scene) return;
-    this.touch();
-    const button = this.button(name);
+    const button = this.root.querySelector(`[data-do=${name}]`);
     switch (name) {
       case "fly":
         this.fly = !this.fly;
         button.setAttribute("aria-pressed", String(this.fly));
-        this.say(this.fly ? "Flying: drags turn the view, and it may leave the range of good views."
-          : "Orbiting: drags turn the scene.");
+        this.say(this.fly ? "Flying: drags turn the view." : "Orbiting: drags turn the scene.");
         break;
       case "nearer": this.fly ? this.move([0, 0, 1], 0.25) : this.wheel(1); break;
       case "farther": this.fly ? this.move([0, 0, -1], 0.25) : this.wheel(-1); break;
       case "view":
         this.reset((this.view + 1) % this.cameras.length);
-        this.sayPlace();
+        this.say(`The place of photograph ${this.view + 1} of ${this.cameras.length}.`);
         break;
       case "reset": this.reset(); break;
       case "levels":
@@ -1439,32 +1177,23 @@ class SplatViewer {
         this.sayCount();
         break;
       case "picture": this.savePicture(); break;
-      case "share": this.share(); break;
-      case "help": this.showKeys(this.keys.hidden); break;
+      case "help":
+        this.keys.hidden = !this.keys.hidden;
+        button.setAttribute("aria-expanded", String(!this.keys.hidden));
+        break;
     }
-  }
-
-  showKeys(open) {
-    this.keys.hidden = !open;
-    this.button("help").setAttribute("aria-expanded", String(open));
   }
 
   listen() {
     const { canvas, pointers } = this;
-    this.root.addEventListener("keydown", (event) => {
-      if (event.key !== "Escape" || this.keys.hidden) return;
-      this.showKeys(false);
-      event.preventDefault();
-    });
     this.root.querySelector(".splat-tools").addEventListener("click", (event) => {
       const button = event.target.closest("button");
       if (button) this.act(button.dataset.do);
     });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("pointerdown", (event) => {
-      this.touch();
       canvas.setPointerCapture(event.pointerId);
-      canvas.focus({ preventScroll: true, focusVisible: false });
+      canvas.focus({ preventScroll: true });
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
     });
     const release = (event) => pointers.delete(event.pointerId);
@@ -1489,7 +1218,6 @@ class SplatViewer {
     });
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
-      this.touch();
       if (this.scene) this.wheel(-event.deltaY / (event.deltaMode === 0 ? 100 : 3));
     }, { passive: false });
     canvas.addEventListener("keydown", (event) => this.keyDown(event));
@@ -1499,7 +1227,6 @@ class SplatViewer {
   }
 
   keyDown(event) {
-    this.touch();
     if (!this.scene || event.ctrlKey || event.altKey || event.metaKey) return;
     const step = 24;
     const arrows = {
@@ -1543,11 +1270,6 @@ class SplatViewer {
     };
     requestAnimationFrame(frame);
   }
-}
-
-/** Whether the browser shares such a file with other programs. */
-function canShare(file) {
-  return Boolean(navigator.canShare?.({ files: [file] }));
 }
 
 /** Offers a blob as a download. */

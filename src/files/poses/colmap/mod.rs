@@ -3,7 +3,7 @@
 //! Poses in the file are camera-from-world (quaternion wxyz and translation), OpenCV
 //! axes; pixel centres lie at +0.5, as here. `rigs.*` and `frames.*` of COLMAP 4 are
 //! ignored: `images.*` still holds every pose. Distortion is removed when a frame is
-//! loaded ([`crate::files::photos::undistort`]). Camera models that are read: [`MODELS_READ`]; others are
+//! loaded ([`crate::files::photos::undistort`]). Camera models that are read: `MODELS_READ`; others are
 //! refused by name. An EQUIRECTANGULAR picture becomes several frames
 //! ([`crate::files::photos::views`]).
 //!

@@ -47,11 +47,12 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     } else {
         None
     };
+    let beside: Option<Vec<Camera>> =
+        beside.map(|all| all.into_iter().map(|(_, camera)| camera).collect());
     if let Some(density) = args.gaussians {
         let options = stored.unwrap_or_else(|| RasterOptions::new(Convention::Standard));
         let count = density.limit(all, 1, 1).max(1);
-        let places = beside.iter().flatten().map(|(_, camera)| *camera);
-        let cameras: Vec<Camera> = places.chain(own).collect();
+        let cameras: Vec<Camera> = beside.iter().flatten().copied().chain(own).collect();
         splats = progress.stage("merging", |_| {
             let renderer = &mut Renderer::default();
             Ok::<_, anyhow::Error>(reduce(&splats, &cameras, &options, count, renderer))
@@ -84,15 +85,8 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             );
         }
         let title = file.file_stem().unwrap_or_default().to_string_lossy();
-        let first = || own.into_iter().map(|camera| (String::new(), camera)).collect();
-        let cameras = beside.unwrap_or_else(first);
-        let page = Page {
-            splats: &splats,
-            cameras: &cameras,
-            photographs: false,
-            options: &options,
-            title: &title,
-        };
+        let cameras = beside.unwrap_or_else(|| own.into_iter().collect());
+        let page = Page { splats: &splats, cameras: &cameras, options: &options, title: &title };
         page.write(&args.out, &save)
     })?;
     let kind =

@@ -101,9 +101,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         output::write_config(&args.out, model.config())?;
         let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
         let origin = comment_of_origin(plan.scene.origin);
-        let name = |i: &usize| plan.scene.frames[*i].name.clone();
-        let places = result.inputs().iter().map(|c| c.target_camera);
-        let cameras: Vec<(String, Camera)> = plan.context.iter().map(name).zip(places).collect();
+        let cameras: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
         let comments = std::iter::once(comment_of_options(&options));
         let comments = comments.chain(camera).chain(origin).collect();
         let save = SaveOptions {
@@ -115,7 +113,6 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         let page = Page {
             splats: result.splats(),
             cameras: &cameras,
-            photographs: true,
             options: &options,
             title: &plan.scene.name,
         };

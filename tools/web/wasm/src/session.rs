@@ -6,7 +6,7 @@ use std::ops::{ControlFlow, RangeInclusive};
 use std::path::Path;
 use subsplat::EstimateOptions;
 use subsplat::{
-    Backend, Camera, DeviceChoice, FitOptions, KnownLens, LoadOptions, Options, Photo, Photograph,
+    Backend, Camera, DeviceChoice, FitOptions, LoadOptions, Options, Photo, Photograph,
     RasterOptions, Reconstructor, Refine, SaveOptions, SplatFormat, Splats, Warning, encode_splats,
     estimate_cameras, parse_photograph,
 };
@@ -43,8 +43,6 @@ struct Request {
     size: usize,
     /// The network's device.
     network: String,
-    /// Focal length of the photographs as of 35 mm film, mm; `None` leaves it to them.
-    focal: Option<f32>,
 }
 
 impl Request {
@@ -62,28 +60,8 @@ impl Request {
             effort: number("effort", 0..=2)?,
             size: number("size", 32..=1024)?,
             network: text("network"),
-            focal: Some(text("focal")).filter(|text| !text.is_empty()).map(focal).transpose()?,
         })
     }
-}
-
-/// Shortest and longest focal length that a person may give, mm of 35 mm film.
-const FOCAL_MM: [f32; 2] = [8.0, 400.0];
-/// Diagonal of a photograph on 35 mm film, mm.
-const FILM_DIAGONAL_MM: f32 = 43.27;
-
-fn focal(text: String) -> Result<f32, String> {
-    let [least, most] = FOCAL_MM;
-    let found = text.parse::<f32>().ok().filter(|mm| (least..=most).contains(mm));
-    found.ok_or_else(|| format!("Focal length: expected {least} to {most} mm, got {text:?}"))
-}
-
-/// The lens of a focal length as of 35 mm film, which the diagonal defines, for photographs of the size of the first.
-fn lens(focal_mm: f32, photographs: &[(String, Photograph)]) -> Option<KnownLens> {
-    let image = &photographs.first()?.1.image;
-    let (width, height) = (image.width as f32, image.height as f32);
-    let focal_px = focal_mm * width.hypot(height) / FILM_DIAGONAL_MM;
-    Some(KnownLens::FovX(2.0 * (0.5 * width / focal_px).atan()))
 }
 
 /// Processor that ran the network.
@@ -126,8 +104,7 @@ impl Session {
         self.scene = None;
         let photographs = std::mem::take(&mut self.photographs);
         let request = Request::parse(request)?;
-        let lens = request.focal.and_then(|focal| lens(focal, &photographs));
-        let (photos, mut warnings) = with_cameras(photographs, lens)?;
+        let (photos, mut warnings) = with_cameras(photographs)?;
         let mut options = Options::default().with_input_area(request.size * request.size);
         match request.effort {
             0 => options = options.with_fit(FitOptions::off()).with_refine(Refine::Off),
@@ -202,16 +179,15 @@ fn open(device: &str) -> (Backend, Option<String>) {
     }
 }
 
-/// Estimates the cameras of photographs, all of `lens` where it is known. Photographs without one are left out, with a warning.
+/// Estimates the cameras of photographs. Photographs without one are left out, with a warning.
 fn with_cameras(
     photographs: Vec<(String, Photograph)>,
-    lens: Option<KnownLens>,
 ) -> Result<(Vec<Photo>, Vec<String>), String> {
     let (names, photographs): (Vec<String>, Vec<Photograph>) = photographs.into_iter().unzip();
     let mut warnings: Vec<String> = photographs.iter().flat_map(|p| p.warnings.clone()).collect();
     report("cameras", 0.0);
-    let options = EstimateOptions { lens, ..EstimateOptions::default() };
-    let found = estimate_cameras(photographs, &options).map_err(|error| error.to_string())?;
+    let found = estimate_cameras(photographs, &EstimateOptions::default())
+        .map_err(|error| error.to_string())?;
     let estimate = &found.estimate;
     warnings.extend(estimate.left_out_sentences(|photo| names[photo].clone()));
     warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));

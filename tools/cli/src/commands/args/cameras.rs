@@ -62,7 +62,7 @@ pub struct PairArgs {
     /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
     #[arg(long, value_name = "K", hide_short_help = true, help_heading = CAMERAS)]
     pub intrinsics: Option<String>,
-    /// Lens of the photographs: pinhole, panorama, or fisheye[:DEG][:CURVE].
+    /// Lens of the photographs: pinhole, panorama, or `fisheye[:DEG][:CURVE]`.
     ///
     /// By default a picture is a panorama where the file says so, or where it is twice as wide as high and its left and right
     /// edges continue each other; else a photograph. Six views of 90 degrees are made of a panorama, one of at most 90 degrees

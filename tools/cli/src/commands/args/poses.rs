@@ -33,7 +33,7 @@ pub struct PosesArgs {
     /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
     #[arg(long, value_name = "K")]
     pub intrinsics: Option<String>,
-    /// Lens of the photographs: pinhole, panorama, or fisheye[:DEG][:CURVE].
+    /// Lens of the photographs: pinhole, panorama, or `fisheye[:DEG][:CURVE]`.
     ///
     /// By default a picture is a panorama where the file says so, or where it is twice as wide as high and its left and right
     /// edges continue each other; else a photograph. Six views of 90 degrees are made of a panorama, one of at most 90 degrees
