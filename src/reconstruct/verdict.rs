@@ -1,6 +1,17 @@
 //! The verdict on a finished scene, in one sentence.
 //!
-//! RATES
+//! The thresholds were chosen on pairs and fives of four scenes of `../shared/photos` (fox, hololens_table, re10k_0bf,
+//! re10k_0f68) with true cameras, and with wrong rotations, positions, focal lengths or photographs. Quality is the PSNR
+//! of views between the photographs over that of a copy of the nearer one. On the other four scenes, 256 px, 52 cases:
+//!
+//! | verdict | cases | below 3 dB | 3 to 5 dB | 5 dB and more |
+//! |---|---|---|---|---|
+//! | good | 11 | 2 | 2 | 7 |
+//! | usable near the photographs | 21 | 15 | 4 | 2 |
+//! | wrong | 20 | 20 | 0 | 0 |
+//!
+//! With true cameras 6 of 11 are good and 5 usable; the two good ones below 3 dB have cameras that the check calls
+//! imprecise.
 
 use super::Agreement;
 use crate::cameras::check::PairReport;
@@ -103,8 +114,8 @@ fn little_shared(shared: f64) -> String {
 fn cause_of_wrong(misfit: Option<&str>) -> String {
     match misfit {
         Some(sentence) => format!(
-            "the likeliest cause are the cameras ({sentence}); the photographs alone, without the file of cameras, let \
-             the program estimate them"
+            "the cameras are the likeliest cause ({sentence}); the program estimates them from the photographs alone, \
+             without the file of cameras"
         ),
         None => "the likeliest causes are things that moved, photographs of different places, or wrong cameras; \
                  other photographs may help"
