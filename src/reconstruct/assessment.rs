@@ -25,6 +25,8 @@ const SOURCES: usize = 2;
 /// Largest distance of a consistent point from its pixel, there and back, as a share of the picture's width:
 /// 1.3 px of 256.
 const CONSISTENT: f32 = 0.005;
+/// One of so many points measures the parallax.
+const PARALLAX_STEP: usize = 17;
 /// Least alpha of a pixel whose depth counts.
 const OPAQUE: f32 = 0.5;
 
@@ -41,7 +43,8 @@ pub struct Agreement {
     pub over_surface: f64,
     /// PSNR of the other photograph's colours at the same places, dB.
     pub at_same_place: f64,
-    /// Median displacement of a point by the distance between the cameras, share of the picture's width.
+    /// Displacement of a point by the distance between the cameras, share of the picture's width: median over the
+    /// points, each with the photograph in which it moves most.
     pub parallax: f64,
 }
 
@@ -146,7 +149,6 @@ struct Shared {
     consistent: bool,
     /// Squared differences of colour, sums over the channels: over the surface, at the same place.
     differences: [f64; 2],
-    parallax: f32,
 }
 
 /// Compares the point `i` of `from` with the photograph `to`; `None` where `to` does not show it.
@@ -163,17 +165,40 @@ fn compare(from: &Surface<'_>, to: &Surface<'_>, i: usize) -> Option<Shared> {
     let width = from.size().x;
     let colour = from.colour(at);
     let difference = |other: Vec3| f64::from((colour - other).length_squared());
-    // The direction alone, which a turned camera would show there.
-    let direction = point - from.camera.position();
-    let turned = to.camera.project(to.camera.position() + direction);
     Some(Shared {
         consistent: back.is_some_and(|back| back.distance(at) <= CONSISTENT * width),
         differences: [
             difference(to.colour(there)),
             difference(to.colour(at / from.size() * to.size())),
         ],
-        parallax: turned.map_or(0.0, |t| t.distance(there) / width),
     })
+}
+
+/// Displacement of a point of `from` in the picture of `to` by the distance between the cameras, share of its width;
+/// 0 behind the camera.
+fn displacement(from: &Camera, to: &Camera, point: Vec3) -> f32 {
+    // The direction alone, which a turned camera would show there.
+    let turned = to.project(to.position() + (point - from.position()));
+    let width = to.intrinsics().width as f32;
+    match (to.project(point), turned) {
+        (Some(there), Some(turned)) => there.distance(turned) / width,
+        _ => 0.0,
+    }
+}
+
+/// [`Agreement::parallax`].
+fn parallax(surfaces: &[Surface<'_>]) -> f32 {
+    let mut all = Vec::new();
+    for (i, from) in surfaces.iter().enumerate() {
+        for p in (0..from.depth.len()).step_by(PARALLAX_STEP).filter(|&p| from.depth[p] > 0.0) {
+            let point = from.point(from.place(p), from.depth[p]);
+            let others = surfaces.iter().enumerate().filter(|(j, _)| *j != i);
+            let of = |(_, to): (usize, &Surface<'_>)| displacement(&from.camera, &to.camera, point);
+            all.push(others.map(of).fold(0.0, f32::max));
+        }
+    }
+    all.sort_by(f32::total_cmp);
+    all.get(all.len() / 2).copied().unwrap_or(0.0)
 }
 
 fn agreement(surfaces: &[Surface<'_>], sources: &[Vec<usize>]) -> Agreement {
@@ -196,14 +221,12 @@ fn agreement(surfaces: &[Surface<'_>], sources: &[Vec<usize>]) -> Agreement {
         let sum: f64 = shared.iter().map(|s| s.differences[k]).sum();
         -10.0 * (sum / (3.0 * n)).max(1e-10).log10()
     };
-    let mut parallax: Vec<f32> = shared.iter().map(|s| s.parallax).collect();
-    parallax.sort_by(f32::total_cmp);
     Agreement {
         shared: n / points as f64,
         consistent: shared.iter().filter(|s| s.consistent).count() as f64 / n,
         over_surface: decibels(0),
         at_same_place: decibels(1),
-        parallax: f64::from(parallax[parallax.len() / 2]),
+        parallax: f64::from(parallax(surfaces)),
     }
 }
 
