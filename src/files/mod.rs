@@ -21,7 +21,7 @@ pub use splats::{
 };
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
@@ -96,6 +96,18 @@ impl Error {
 pub fn read(path: impl AsRef<Path>) -> Result<Vec<u8>> {
     let path = path.as_ref();
     std::fs::read(path).map_err(|e| Error::io(path, e))
+}
+
+/// The first `count` bytes of a file, or all of a shorter one.
+fn first_bytes(path: &Path, count: usize) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(count);
+    File::open(path)?.take(count as u64).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// The extension of a path in lower case; empty without one.
+fn lower_extension(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_lowercase()
 }
 
 /// Writes `path` through `body`: to a temporary file in the same folder, which is flushed to

@@ -33,7 +33,7 @@ const LEAST_PARALLAX: f64 = 0.04;
 /// Least mean alpha of a good scene's pictures at its inputs' cameras.
 const LEAST_COVERAGE: f64 = 0.85;
 
-/// How far a scene can be trusted.
+/// Trust in a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Trust {
@@ -50,7 +50,7 @@ pub enum Trust {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct SceneVerdict {
-    /// How far the scene can be trusted.
+    /// Trust in the scene.
     pub trust: Trust,
     /// The likeliest cause, and what to do; the agreement of a good scene.
     pub reason: String,

@@ -2,9 +2,8 @@
 //! `jxl`, and raw files. A program of the computer converts them (`programs.rs`); of a raw file the camera's own
 //! JPEG is read where it is large enough (`raw.rs`).
 //!
-//! AVIF has no feature. `rav1d` (BSD-2-Clause) offers C's interface alone, which needs `unsafe`; `re_rav1d` is a
-//! fork of it for one application; `zenavif` and `rav1d-safe` are AGPL-3.0; `image`'s `avif-native` links to the
-//! C library dav1d.
+//! AVIF has no feature: `zenavif` and `rav1d-safe` are AGPL-3.0; `image`'s `avif-native` links to the C library
+//! dav1d.
 //!
 //! Size, rotation, profile and EXIF come from the picture itself, never from the program: its result has to have
 //! the size that the picture states, and is turned exactly once.
@@ -30,7 +29,7 @@ impl Kind {
         }
     }
 
-    /// What a person can do without a program.
+    /// Advice for a person without a program.
     fn advice(self) -> &'static str {
         match self {
             Self::Heic => {

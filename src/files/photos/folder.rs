@@ -4,10 +4,9 @@
 use super::photograph::probe_photograph;
 use super::video::is_video;
 use super::{heic, jxl, raw};
-use crate::files::Error;
 use crate::files::poses::assemble::{files, has_extension};
+use crate::files::{Error, first_bytes, lower_extension};
 use std::collections::HashSet;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Extensions of pictures beside the usual ones and the raw ones; some of the formats are not read.
@@ -76,8 +75,12 @@ pub fn find_photographs(folder: impl AsRef<Path>) -> FolderPhotographs {
 
 fn in_folder(folder: &Path) -> FolderPhotographs {
     let mut found = FolderPhotographs { companions: companions(folder), ..Default::default() };
-    for path in files(folder).into_iter().filter(|path| is_picture(path)) {
-        let reason = if is_moving(&path) {
+    for path in files(folder) {
+        let moving = is_moving(&path);
+        if !moving && !is_picture(&path) {
+            continue;
+        }
+        let reason = if moving {
             found.videos.push(path.clone());
             "a video; give the video alone to use frames of it".to_owned()
         } else {
@@ -100,10 +103,8 @@ fn in_folder(folder: &Path) -> FolderPhotographs {
 /// Leaves out raw, HEIC, AVIF and JPEG XL files beside a JPEG, PNG or TIFF of the same name: two photographs from one
 /// place.
 fn leave_out_twins(found: &mut FolderPhotographs) {
-    let lower =
-        |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().to_lowercase();
-    let is_common = |path: &Path| COMMON_EXTENSIONS.contains(&lower(path.extension()).as_str());
-    let stem = |path: &Path| lower(path.file_stem());
+    let is_common = |path: &Path| COMMON_EXTENSIONS.contains(&lower_extension(path).as_str());
+    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
     let common: HashSet<String> =
         found.photographs.iter().filter(|path| is_common(path)).map(|path| stem(path)).collect();
     let left_out = &mut found.left_out;
@@ -121,7 +122,7 @@ fn leave_out_twins(found: &mut FolderPhotographs) {
 
 /// Returns whether an extension is one of HEIC, AVIF, JPEG XL or a raw format.
 fn has_format_of_its_own(path: &Path) -> bool {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    let extension = lower_extension(path);
     ["heic", "heif", "hif", "avif", "jxl", "cr3", "raf"].contains(&extension.as_str())
         || raw::EXTENSIONS.contains(&extension.as_str())
 }
@@ -132,24 +133,18 @@ fn is_moving(path: &Path) -> bool {
     !gif && is_video(path)
 }
 
-/// Returns whether a file is, or is called, a picture or a video.
+/// Returns whether a file is, or is called, a picture.
 fn is_picture(path: &Path) -> bool {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    if has_extension(path)
+    let extension = lower_extension(path);
+    has_extension(path)
         || OTHER_EXTENSIONS.contains(&&*extension)
         || raw::EXTENSIONS.contains(&&*extension)
-        || is_moving(path)
-    {
-        return true;
-    }
-    let mut start = Vec::with_capacity(START);
-    let read =
-        std::fs::File::open(path).and_then(|file| file.take(START as u64).read_to_end(&mut start));
-    read.is_ok()
-        && (image::guess_format(&start).is_ok()
-            || heic::brand(&start).is_some()
-            || jxl::is_jxl(&start)
-            || raw::is_raw(&start, path))
+        || first_bytes(path, START).is_ok_and(|start| {
+            image::guess_format(&start).is_ok()
+                || heic::brand(&start).is_some()
+                || jxl::is_jxl(&start)
+                || raw::is_raw(&start, path)
+        })
 }
 
 /// Number of files `._*`.

@@ -1,7 +1,7 @@
 //! JPEG XL (ISO/IEC 18181): size and EXIF of a file, and its pixels with feature `jxl`.
 //!
-//! `jxl-oxide` decodes: pure Rust, MIT or Apache-2.0. The official `jxl` is pure Rust too and
-//! has no decoder for the `image` crate. Without the feature a program converts the file (`programs.rs`).
+//! `jxl-oxide` decodes: pure Rust, MIT or Apache-2.0. Without the feature a program converts the file
+//! (`programs.rs`).
 
 use super::heif::find;
 

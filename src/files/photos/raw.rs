@@ -9,6 +9,7 @@
 
 use super::jpeg;
 use super::tiff_tags::{DNG_VERSION, is_tiff, numbers};
+use crate::files::lower_extension;
 use std::path::Path;
 
 /// Extensions of raw files that begin as a TIFF does.
@@ -30,7 +31,7 @@ pub(super) fn is_raw(bytes: &[u8], path: &Path) -> bool {
     if !is_tiff(bytes) {
         return false;
     }
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    let extension = lower_extension(path);
     EXTENSIONS.contains(&extension.as_str())
         || bytes.get(8..10) == Some(b"CR")
         || numbers(bytes, DNG_VERSION).is_some()

@@ -1,4 +1,4 @@
-//! What the assembly of frames leaves out, ignores and corrects.
+//! Entries that the assembly of frames leaves out, ignores and corrects.
 
 use super::scene::LeftOut;
 use crate::files::Error;

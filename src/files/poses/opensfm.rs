@@ -76,7 +76,7 @@ impl Optics {
     /// The camera in pixels.
     ///
     /// # Errors
-    /// What was expected, and what was found.
+    /// Expected and found values.
     fn camera(&self) -> std::result::Result<Camera, (String, String)> {
         let (Some(w), Some(h)) = (side(self.width), side(self.height)) else {
             let got = format!("{}x{}", self.width, self.height);

@@ -1,4 +1,4 @@
-//! How a scene is read: its options, and the search for its pictures.
+//! Options of the reading of a scene, and the search for its pictures.
 
 use super::assemble::{Pictures, find_image_in, has_extension, list_images, similar_key};
 use super::matrices::PoseConvention;
@@ -7,7 +7,7 @@ use std::cell::RefCell;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// What to read of a scene, and how strictly: options of [`load_scene_with`](super::scene::load_scene_with).
+/// Options of a reading: [`load_scene_with`](super::scene::load_scene_with).
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct SceneOptions {
     /// Pose file, or folder of a COLMAP model: a path below the scene's folder, or any path. Default: the first
@@ -15,7 +15,7 @@ pub struct SceneOptions {
     pub model: Option<PathBuf>,
     /// Folder of the pictures. Default: the folders in which the program that wrote the pose file has them.
     pub images: Option<PathBuf>,
-    /// Whether an entry that is left out, a mask that is not used and a point without a position are an error.
+    /// Refuses an entry that is left out, a mask that is not used and a point without a position.
     /// By default the scene is read without them, and a warning names them.
     pub strict: bool,
     /// Direction and axes of the matrices of `poses.txt`, `transforms.json` and Polycam, where a program wrote

@@ -23,7 +23,7 @@ use crate::files::photos::masks;
 use crate::files::photos::photograph::{Photograph, load_photograph, load_photograph_or_panorama};
 use crate::files::photos::undistort::{Distortion, pinhole, undistort, undistort_masked};
 use crate::files::photos::views::Cut;
-use crate::files::{Error, Result};
+use crate::files::{Error, Result, lower_extension};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::{DVec3, Vec3};
@@ -239,7 +239,7 @@ pub struct LeftOut {
     pub entry: usize,
     /// Path of the picture in the pose file.
     pub name: String,
-    /// What is wrong.
+    /// Reason.
     pub reason: String,
 }
 
@@ -510,7 +510,7 @@ pub fn has_scene(path: impl AsRef<Path>) -> bool {
 fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     let folder = path.parent().unwrap_or(Path::new(""));
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    let extension = lower_extension(path);
     match (name.as_str(), extension.as_str()) {
         (_, "json") | ("metadata", "") => match find::foreign_json(path) {
             Some(file) => load_found(&file, reading),

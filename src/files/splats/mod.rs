@@ -28,7 +28,7 @@ pub mod sog;
 pub mod splat;
 pub mod spz;
 
-use crate::files::{Error, Result, read, write_atomic};
+use crate::files::{Error, Result, first_bytes, read, write_atomic};
 use crate::scene::splats::Splats;
 use gaussians::{Decoded, HALF_TURN_X, Outgoing};
 use glam::{DMat3, DVec3};
@@ -215,9 +215,8 @@ pub fn is_splat_file(path: impl AsRef<Path>) -> bool {
     if sog_meta(path).is_some() {
         return true;
     }
-    let mut head = Vec::new();
     // The name decides for a file that cannot be read, and the reader says why.
-    let _ = File::open(path).and_then(|f| Read::take(f, 4).read_to_end(&mut head));
+    let head = first_bytes(path, 4).unwrap_or_default();
     path.is_file() && format_of(&head, path).is_ok()
 }
 

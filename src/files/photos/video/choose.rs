@@ -23,7 +23,7 @@ pub(super) const FARTHEST: f64 = 2.5;
 const DEFAULT_FRAMES: (usize, usize) = (12, 36);
 /// Part of the distance between two places over which the sharpest frame is looked for, on either side.
 const SURROUNDINGS: f64 = 0.4;
-/// What a frame at the end of its surroundings loses against one at the place, of the relative sharpness.
+/// Loss of relative sharpness of a frame at the end of its surroundings, against one at the place.
 const OFF_PLACE: f64 = 0.25;
 /// Candidates on either side with which a frame's sharpness is compared.
 const NEIGHBOURS: usize = 5;

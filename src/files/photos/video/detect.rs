@@ -1,7 +1,7 @@
 //! Recognises videos by their first bytes, and by their extension where the bytes say nothing.
 
 use super::super::heic;
-use std::io::Read;
+use crate::files::{first_bytes, lower_extension};
 use std::path::Path;
 
 /// Extensions of videos.
@@ -35,19 +35,12 @@ pub fn is_animated_webp(path: impl AsRef<Path>) -> bool {
 
 /// Returns whether a name ends as those of videos do.
 pub(in crate::files) fn has_video_extension(path: &Path) -> bool {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    EXTENSIONS.contains(&extension.as_str())
+    EXTENSIONS.contains(&lower_extension(path).as_str())
 }
 
 fn start(path: &Path) -> Vec<u8> {
-    let mut start = Vec::with_capacity(START);
-    if path.is_file()
-        && let Ok(file) = std::fs::File::open(path)
-    {
-        // A file that cannot be read is no video; its reader names the error.
-        let _ = file.take(START as u64).read_to_end(&mut start);
-    }
-    start
+    // A file that cannot be read is no video; its reader names the error.
+    if path.is_file() { first_bytes(path, START).unwrap_or_default() } else { Vec::new() }
 }
 
 fn is_picture(start: &[u8]) -> bool {

@@ -1,4 +1,4 @@
-//! What ffprobe says about a video: the stream, its size, rotation, times and colours.
+//! Description of a video by ffprobe: the stream, its size, rotation, times and colours.
 
 use crate::files::{Error, Result};
 use serde_json::Value;
@@ -165,7 +165,7 @@ fn rotation(stream: &Value) -> u16 {
     if quarter.is_finite() { 90 * quarter as u16 } else { 0 }
 }
 
-/// What a file without moving pictures has.
+/// Content of a file without moving pictures.
 fn no_video(streams: &[Value]) -> String {
     let has = |kind: &str| streams.iter().any(|s| text(&s["codec_type"]) == kind);
     match (has("video"), has("audio")) {

@@ -83,7 +83,7 @@ pub struct TakenFrames {
     pub warnings: Vec<String>,
 }
 
-/// What is called with the progress; [`ControlFlow::Break`] stops ffmpeg.
+/// Callback for progress; [`ControlFlow::Break`] stops ffmpeg.
 type OnProgress<'a> = &'a mut dyn FnMut(VideoProgress) -> ControlFlow<()>;
 
 /// Chooses frames of the video at `path` and writes them into `folder`, which is created, as JPEG files of at most

@@ -20,7 +20,7 @@ const ENTRIES_MAX: usize = 4096;
 const DECODED_FREE: u64 = 64 << 20;
 const RATIO_MAX: u64 = 256;
 
-/// Where the files are.
+/// Place of the files.
 enum Place<'a> {
     /// Entries whose names begin with the prefix.
     Zip { archive: ZipArchive<Cursor<&'a [u8]>>, prefix: String },

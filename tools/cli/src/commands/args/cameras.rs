@@ -8,7 +8,7 @@ use subsplat::files::poses::matrices::PoseConvention;
 use subsplat::files::poses::reading::SceneOptions;
 use subsplat::reconstruct::Projection;
 
-/// What to read of a scene with cameras.
+/// Parts of a scene with cameras that are read.
 #[derive(Clone, Debug, Default, Args)]
 pub struct ReadArgs {
     /// Cameras to read, where a scene has several: a pose file, or the folder of a COLMAP model.

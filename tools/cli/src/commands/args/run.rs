@@ -108,7 +108,7 @@ impl RunArgs {
         formats
     }
 
-    /// Whether the page was asked for by name, and holds the scene whatever its size.
+    /// Returns whether the page was asked for by name, and holds the scene whatever its size.
     pub fn whole_page(&self) -> bool {
         self.save.contains(&SceneFormatArg::Html)
     }
