@@ -60,6 +60,15 @@ pub enum Warning {
         /// Share that no picture shows, 0 to 1.
         share: f32,
     },
+    /// Black lines along the sides of photographs, as a removal of lens distortion leaves them, were filled with
+    /// the pixels inside them.
+    #[non_exhaustive]
+    FrameFilled {
+        /// Number of photographs.
+        photographs: usize,
+        /// Largest number of lines at a side, px.
+        lines: usize,
+    },
     /// The weights lack some or all of SubSplat's tensors, the heads that place children.
     #[non_exhaustive]
     UntrainedTensors {
@@ -113,6 +122,11 @@ impl fmt::Display for Warning {
                 "{:.0} % of a photograph of {size} is cut at its edges: pictures of {picture} have \
                  another shape",
                 100.0 * share
+            ),
+            Self::FrameFilled { photographs, lines } => write!(
+                f,
+                "black lines along the sides of {photographs} photograph(s), up to {lines} pixels wide, are \
+                 filled with the pixels beside them"
             ),
             Self::UntrainedTensors { count, upscale } => {
                 write!(
@@ -173,8 +187,8 @@ impl Warning {
         reports.iter().enumerate().flat_map(pair).collect()
     }
 
-    /// Sizes that were cut, photographs that were enlarged, and those that lose more than [`MUCH`]; each
-    /// warning once.
+    /// Sizes that were cut, photographs that were enlarged, those that lose more than [`MUCH`], and frames that
+    /// were filled; each warning once.
     pub(super) fn of_crops(
         photos: &[Photo],
         inputs: &[Cropped],
@@ -208,6 +222,11 @@ impl Warning {
                 let picture = Size::new(c.target.width, c.target.height);
                 add(Self::PhotographCut { size: photo.size(), picture, share });
             }
+        }
+        let frames: Vec<usize> =
+            inputs.iter().map(|c| c.frame).filter(|lines| *lines > 0).collect();
+        if let Some(&lines) = frames.iter().max() {
+            add(Self::FrameFilled { photographs: frames.len(), lines });
         }
         warnings
     }

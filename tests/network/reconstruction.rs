@@ -158,6 +158,29 @@ fn a_prepared_scene_reconstructs_after_its_photographs_are_freed() {
     assert!(parts.warnings().iter().any(enlarged), "{:?}", parts.warnings());
 }
 
+#[test]
+fn black_lines_at_a_side_are_filled_and_named() {
+    let (model, photos) = (untrained(), photos());
+    let framed = |photo: &Photo, lines: usize| {
+        let mut picture = photo.image().clone();
+        let width = picture.width;
+        for row in picture.data.chunks_exact_mut(3 * width) {
+            row.iter_mut().for_each(|v| *v = (*v).max(60));
+            row[..3 * lines].fill(0);
+        }
+        Photo::new(picture, *photo.camera()).unwrap()
+    };
+    let warnings = |lines: [usize; 2]| {
+        let photos = [framed(&photos[0], lines[0]), framed(&photos[1], lines[1])];
+        let result = model.run(&photos, &quick().with_refine(Refine::Off)).unwrap();
+        Warning::sentences(result.warnings())
+    };
+    let named = "black lines along the sides of 1 photograph(s), up to 3 pixels wide, are filled with \
+                 the pixels beside them";
+    assert!(warnings([3, 0]).iter().any(|w| w == named));
+    assert!(warnings([0, 0]).iter().all(|w| !w.starts_with("black lines")));
+}
+
 /// The second photograph shows the same picture as the first, from another camera.
 #[test]
 fn bad_poses_are_warnings_or_an_error() {

@@ -8,6 +8,7 @@ mod initial_values;
 mod mixed_counts;
 mod on_device;
 mod recompute;
+mod scene;
 mod scene_gaussians;
 
 pub use initial_values::{initial_value, set_initial_values};
@@ -16,19 +17,20 @@ pub(super) use on_device::DeviceParents;
 pub use recompute::Recomputed;
 pub use scene_gaussians::Children;
 
-use super::aggregation::{Aggregation, Prepared};
-use super::embed::{Descriptors, Embeddings};
-use super::geometry::{Frames, ParentChunk};
+use scene::{ParentArrays, Records, Scene, Span, check_single, check_views, chunks};
+
+use super::aggregation::Aggregation;
+use super::embed::Embeddings;
 use super::mlp::Mode;
 use super::spgr_heads::{Heads, rules};
 use super::trace::Checkpoint;
 use super::{BackboneOutput, Primaries, Views};
-use crate::network::config::{Config, FeatureLevel, ShInput, SpgrHead};
+use crate::network::config::{Config, FeatureLevel, SpgrHead};
 use crate::network::ops::Executor;
 use crate::network::ops::direct_rendering::{Footprint, rasterize_footprints, spgr_footprints};
-use crate::network::ops::spgr::{Rules, Spgr, spgr_on};
+use crate::network::ops::spgr::{Rules, spgr_on};
 use crate::network::ops::{Array, Backend, rasterize_on};
-use candle_core::{DType, Device, Result, Tensor, bail};
+use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -76,53 +78,6 @@ pub struct Trunk {
     backend: Backend,
     /// The GPU of `backend`, if it is one.
     executor: Option<Arc<Executor>>,
-}
-
-/// Arrays that all chunks of one scene share.
-#[derive(Clone)]
-struct Scene<'a, A = Tensor> {
-    views: &'a Views,
-    frames: Frames,
-    means: A,
-    quats_wxyz: A,
-    scales: A,
-    opacities: A,
-    sh_input: A,
-    per_view: usize,
-    prepared: Option<Prepared<A>>,
-    /// The heads for the r of `rules`.
-    heads: Heads,
-    rules: Rules,
-}
-
-/// Arrays of one scene's N parents on one executor.
-struct ParentArrays<A> {
-    /// `[N, 3]`.
-    means: A,
-    /// `[N, 4]`.
-    quats_wxyz: A,
-    /// `[N, 3]`.
-    scales: A,
-    /// `[N, 1]`.
-    opacities: A,
-    /// `[N, 3·D]`.
-    sh_input: A,
-    per_view: usize,
-}
-
-/// Consecutive parents of one view.
-#[derive(Clone, Copy, Debug)]
-struct Span {
-    first: usize,
-    len: usize,
-}
-
-/// Input of SPGR for one chunk.
-struct Records<A = Tensor> {
-    /// `[n, K, 11]`: head records.
-    head: A,
-    /// `[n, 11]`: packed parents.
-    parents: A,
 }
 
 /// Division of the parents into chunks, and the mode of their layers.
@@ -177,9 +132,7 @@ impl Trunk {
     /// [`Trunk::trains_on_device`], else of gathers and SPGR.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.backend = backend.clone();
-        {
-            self.executor = Executor::new(backend);
-        }
+        self.executor = Executor::new(backend);
         if let Some(agg) = self.parts.as_mut().and_then(|p| p.aggregation.as_mut()) {
             agg.set_backend(backend);
         }
@@ -458,113 +411,6 @@ impl Trunk {
         })
     }
 
-    fn scene<'a>(
-        &self,
-        parts: &Parts,
-        views: &'a Views,
-        backbone: &BackboneOutput,
-        primaries: &Primaries,
-    ) -> Result<Scene<'a>> {
-        self.scene_on(parts, views, backbone, primaries, |t| Ok(t.clone()))
-    }
-
-    /// [`Trunk::scene`] on the executor to which `like` copies tensors.
-    fn scene_on<'a, A: Array>(
-        &self,
-        parts: &Parts,
-        views: &'a Views,
-        backbone: &BackboneOutput,
-        primaries: &Primaries,
-        like: impl Fn(&Tensor) -> Result<A>,
-    ) -> Result<Scene<'a, A>> {
-        check_single(views, primaries)?;
-        // Contiguous once, so that no chunk copies its rows out of wider ones.
-        let own = |t: &Tensor| like(&t.squeeze(0)?.contiguous()?);
-        let (_, n, _) = primaries.means.dims3()?;
-        let sh = match self.config.embed.sh {
-            ShInput::World => &primaries.sh,
-            ShInput::Camera => &primaries.sh_camera,
-        };
-        let (_, _, channels, d) = sh.dims4()?;
-        let expected = sh_coefficients(self.config.primaries().sh_degree);
-        if (channels, d) != (3, expected) {
-            bail!("primaries SH: expected [1, {n}, 3, {expected}], got {:?}", sh.dims());
-        }
-        let arrays = ParentArrays {
-            means: own(&primaries.means)?,
-            quats_wxyz: own(&primaries.quats_wxyz)?,
-            scales: own(&primaries.scales)?,
-            opacities: own(&primaries.opacities)?.reshape((n, 1))?,
-            sh_input: like(&sh.reshape((n, 3 * d))?)?,
-            per_view: primaries.per_view,
-        };
-        let kind = (primaries.means.dtype(), primaries.means.device());
-        let feature = |level| like(backbone.feature(level)?);
-        self.scene_from(parts, views, arrays, kind, feature)
-    }
-
-    /// The scene of `parents`; `feature` returns a level of the backbone's feature maps, and the cameras
-    /// become tensors of `dtype` on `device`.
-    fn scene_from<'a, A: Array>(
-        &self,
-        parts: &Parts,
-        views: &'a Views,
-        parents: ParentArrays<A>,
-        (dtype, device): (DType, &Device),
-        feature: impl Fn(FeatureLevel) -> Result<A>,
-    ) -> Result<Scene<'a, A>> {
-        let frames = Frames::new(&views.cameras[0], dtype, device)?;
-        let ParentArrays { means, quats_wxyz, scales, opacities, sh_input, per_view } = parents;
-        let prepared = match &parts.aggregation {
-            Some(agg) => Some(agg.prepare(views, &frames, feature, &means)?),
-            None => None,
-        };
-        Ok(Scene {
-            views,
-            frames,
-            means,
-            quats_wxyz,
-            scales,
-            opacities,
-            sh_input,
-            per_view,
-            prepared,
-            heads: parts.heads.for_children(self.rules.children())?,
-            rules: self.rules,
-        })
-    }
-
-    /// Records of the parents in `span`.
-    fn records<A: Array>(
-        &self,
-        parts: &Parts,
-        scene: &Scene<'_, A>,
-        span: Span,
-        mode: Mode,
-    ) -> Result<Records<A>> {
-        self.records_of(parts, scene, scene.chunk(span)?, mode)
-    }
-
-    fn records_of<A: Array>(
-        &self,
-        parts: &Parts,
-        scene: &Scene<'_, A>,
-        parents: ParentChunk<A>,
-        mode: Mode,
-    ) -> Result<Records<A>> {
-        let z: Descriptors<A> = parts.embeddings.forward(&parents, &scene.frames)?;
-        let inputs = match (&parts.aggregation, &scene.prepared) {
-            (Some(agg), Some(prepared)) => {
-                let f = agg.forward(prepared, &parents, &scene.frames, &z, mode)?;
-                agg.head_inputs(f, &z)?
-            }
-            // f = 0 without aggregation, so that the heads read z.
-            _ => z,
-        };
-        let head = scene.heads.forward(&inputs, scene.rules.children())?;
-        Ok(Records { head, parents: parents.rows()? })
-    }
-
     /// Returns the primaries of the one scene in `views` as their own children, K = 1.
     ///
     /// # Errors
@@ -582,69 +428,6 @@ impl Trunk {
             k: 1,
         })
     }
-}
-
-impl<A: Array> Scene<'_, A> {
-    fn chunk(&self, Span { first, len }: Span) -> Result<ParentChunk<A>> {
-        Ok(ParentChunk {
-            first,
-            source: first / self.per_view,
-            means: self.means.narrow(0, first, len)?,
-            quats_wxyz: self.quats_wxyz.narrow(0, first, len)?,
-            scales: self.scales.narrow(0, first, len)?,
-            opacities: self.opacities.narrow(0, first, len)?,
-            sh: self.sh_input.narrow(0, first, len)?,
-        })
-    }
-
-    fn call(&self, span: Span) -> Spgr {
-        Spgr {
-            rules: self.rules,
-            cameras: self.views.cameras[0].clone(),
-            near: self.views.near_far[0].iter().map(|range| range.near).collect(),
-            per_view: self.per_view,
-            first: span.first,
-        }
-    }
-}
-
-/// Splits `n` parents into spans of at most `size` parents, each within one view.
-fn chunks(n: usize, per_view: usize, size: usize) -> impl Iterator<Item = Span> {
-    let views = n / per_view.max(1);
-    (0..views).flat_map(move |v| {
-        (0..per_view.div_ceil(size)).map(move |i| {
-            let first = v * per_view + i * size;
-            Span { first, len: size.min((v + 1) * per_view - first) }
-        })
-    })
-}
-
-fn check_single(views: &Views, primaries: &Primaries) -> Result<()> {
-    let (b, n, _) = primaries.means.dims3()?;
-    if views.scenes() != 1 || b != 1 {
-        bail!("trunk: expected one scene, got {} of views and {b} of primaries", views.scenes());
-    }
-    check_views(views, n, primaries.per_view)?;
-    let fits = primaries.quats_wxyz.dims() == [1, n, 4]
-        && primaries.scales.dims() == [1, n, 3]
-        && primaries.opacities.dims() == [1, n];
-    if !fits {
-        bail!(
-            "primaries: expected quaternions [1, {n}, 4], scales [1, {n}, 3], opacities [1, {n}], got {:?}, {:?}, {:?}",
-            primaries.quats_wxyz.dims(),
-            primaries.scales.dims(),
-            primaries.opacities.dims()
-        );
-    }
-    Ok(())
-}
-
-/// Refuses `n` parents that are not `per_view` of each view.
-fn check_views(views: &Views, n: usize, per_view: usize) -> Result<()> {
-    if per_view == 0 || n != per_view * views.views() {
-        bail!("primaries: expected {} views of {per_view} parents, got {n} parents", views.views());
-    }
-    Ok(())
 }
 
 /// `[1, N, 3, D]` to `[N, D, 3]`.

@@ -115,6 +115,8 @@ pub struct Cropped {
     pub target_camera: Camera,
     /// Position of `target` in the photograph.
     pub window: PhotoWindow,
+    /// Largest width of the photograph's dark frame, which was filled; px of the photograph, 0 without one.
+    pub frame: usize,
 }
 
 impl Cropped {
@@ -264,7 +266,7 @@ pub fn crop_masked(
     let unmasked = mask.map(|mask| mask.filled(photo));
     let photo = unmasked.as_ref().unwrap_or(photo);
     let filled = (options.rule == CropRule::Exact).then(|| frame::filled(photo)).flatten();
-    let photo = filled.as_ref().unwrap_or(photo);
+    let (photo, frame) = filled.as_ref().map_or((photo, 0), |(filled, lines)| (filled, *lines));
     let input_size = (w - w % stride, h - h % stride);
     let size = (photo.width, photo.height);
     // The target loses the same share as the input. At whole upscales the window lies in whole
@@ -300,6 +302,7 @@ pub fn crop_masked(
         target_mask: target_mask.filter(|mask| !mask.keeps_all()),
         target_camera: with_intrinsics(camera, target_k)?,
         window: plan.window(size),
+        frame,
     })
 }
 

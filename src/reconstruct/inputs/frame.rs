@@ -74,8 +74,9 @@ impl Side {
     }
 }
 
-/// Returns `picture` with its dark frame replaced by the pixels inside it; `None` without a frame.
-pub(super) fn filled(picture: &Rgb) -> Option<Rgb> {
+/// Returns `picture` with its dark frame replaced by the pixels inside it, and the largest width of the frame,
+/// px; `None` without a frame.
+pub(super) fn filled(picture: &Rgb) -> Option<(Rgb, usize)> {
     let frames = Side::ALL.map(|side| side.frame(picture));
     if frames == [0; 4] {
         return None;
@@ -91,7 +92,7 @@ pub(super) fn filled(picture: &Rgb) -> Option<Rgb> {
             }
         }
     }
-    Some(filled)
+    Some((filled, frames.into_iter().max().unwrap_or_default()))
 }
 
 #[cfg(test)]
@@ -123,7 +124,8 @@ mod tests {
     fn a_frame_is_replaced_by_the_pixels_inside() {
         for frame in [[5, 0, 0, 0], [0, 3, 0, 0], [0, 0, 2, 0], [0, 0, 0, 4], [4, 3, 2, 1]] {
             let (framed, whole) = framed(frame, 120);
-            let filled = filled(&framed).expect("a frame");
+            let (filled, lines) = filled(&framed).expect("a frame");
+            assert_eq!(Some(lines), frame.into_iter().max());
             let worst = filled.data.iter().zip(&whole.data).map(|(a, b)| a.abs_diff(*b)).max();
             assert!(worst <= Some(1), "{frame:?}: {worst:?}");
         }
@@ -138,7 +140,7 @@ mod tests {
             row[6..9].iter_mut().for_each(|v| *v /= 3);
             row[9..12].iter_mut().for_each(|v| *v -= *v / 4);
         }
-        assert_eq!(filled(&picture).expect("a frame"), whole);
+        assert_eq!(filled(&picture).expect("a frame"), (whole, 4));
     }
 
     #[test]

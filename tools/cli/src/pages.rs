@@ -16,6 +16,9 @@
 //! static PAGES: subsplat_cli::pages::Pages = subsplat_cli::pages::Pages;
 //! ```
 //! On other systems than Linux on x86-64 and AArch64 it is the system's allocator.
+//!
+//! A request that finds no memory ends the program with one line and the exit code 1, on Unix. Rust's own answer is
+//! an abort, which writes a backtrace and a core dump, and the standard library has no stable way to replace it.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 
@@ -56,11 +59,13 @@ fn is_large(layout: &Layout) -> bool {
 // that.
 unsafe impl GlobalAlloc for Pages {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        if is_large(&layout) {
-            return large::allocate(layout.size()).0;
-        }
-        // SAFETY: the caller's.
-        unsafe { System.alloc(layout) }
+        let at = if is_large(&layout) {
+            large::allocate(layout.size()).0
+        } else {
+            // SAFETY: the caller's.
+            unsafe { System.alloc(layout) }
+        };
+        exhausted::unless_null(at, layout.size())
     }
 
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
@@ -74,9 +79,11 @@ unsafe impl GlobalAlloc for Pages {
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         if !is_large(&layout) {
             // SAFETY: the caller's.
-            return unsafe { System.alloc_zeroed(layout) };
+            let at = unsafe { System.alloc_zeroed(layout) };
+            return exhausted::unless_null(at, layout.size());
         }
         let (at, used) = large::allocate(layout.size());
+        let at = exhausted::unless_null(at, layout.size());
         if used && !at.is_null() {
             // SAFETY: a block of this size.
             unsafe { at.write_bytes(0, layout.size()) };
@@ -89,7 +96,8 @@ unsafe impl GlobalAlloc for Pages {
         let wanted = unsafe { Layout::from_size_align_unchecked(size, layout.align()) };
         if !is_large(&layout) && !is_large(&wanted) {
             // SAFETY: the caller's; both are small.
-            return unsafe { System.realloc(at, layout, size) };
+            let to = unsafe { System.realloc(at, layout, size) };
+            return exhausted::unless_null(to, size);
         }
         // SAFETY: the new block holds the lesser of both sizes, and the old one came from here.
         unsafe {
@@ -99,6 +107,53 @@ unsafe impl GlobalAlloc for Pages {
                 self.dealloc(at, layout);
             }
             to
+        }
+    }
+}
+
+/// The end of a program without memory.
+mod exhausted {
+    /// Returns `at`, a block of `size` bytes; where it is null on Unix, ends the program.
+    #[inline]
+    pub(super) fn unless_null(at: *mut u8, size: usize) -> *mut u8 {
+        #[cfg(unix)]
+        if at.is_null() {
+            end(size);
+        }
+        let _ = size;
+        at
+    }
+
+    /// The line that the program ends with, in `buffer`; nothing here allocates.
+    #[cfg(any(unix, test))]
+    pub(super) fn line(size: usize, buffer: &mut [u8; 256]) -> &[u8] {
+        use std::io::Write;
+        let mut rest = &mut buffer[..];
+        // A line that is too long is cut.
+        let _ = writeln!(
+            rest,
+            "error: not enough memory: {} KiB more were needed; --quality fast, fewer photographs and smaller \
+             pictures (--size) need less",
+            size.div_ceil(1024)
+        );
+        let left = rest.len();
+        &buffer[..buffer.len() - left]
+    }
+
+    #[cfg(unix)]
+    #[cold]
+    fn end(size: usize) -> ! {
+        use std::ffi::{c_int, c_void};
+        unsafe extern "C" {
+            fn write(file: c_int, from: *const c_void, length: usize) -> isize;
+            fn _exit(code: c_int) -> !;
+        }
+        let mut buffer = [0; 256];
+        let line = line(size, &mut buffer);
+        // SAFETY: the buffer is as long as it is read; neither function allocates, and the process ends.
+        unsafe {
+            write(2, line.as_ptr().cast(), line.len());
+            _exit(1)
         }
     }
 }
@@ -386,6 +441,17 @@ mod tests {
             assert!(all[..small].iter().all(|v| *v == 9) && all[small] == 3);
             Pages.dealloc(at, layout(small + 1));
         }
+    }
+
+    #[test]
+    fn the_last_line_names_the_size() {
+        let mut buffer = [0; 256];
+        let line = String::from_utf8(exhausted::line(5_000_000, &mut buffer).to_vec()).unwrap();
+        assert!(
+            line.starts_with("error: not enough memory: 4883 KiB more were needed; "),
+            "{line}"
+        );
+        assert!(line.ends_with("need less\n"), "{line}");
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Output for the user: progress bars, lines, and the answer of a command.
 
 use anyhow::Context;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 use serde::Serialize;
 use std::io::{IsTerminal, Write};
 use std::ops::ControlFlow;
@@ -72,10 +72,7 @@ impl Progress {
     ) -> Result<T, E> {
         let bar = ProgressBar::new(total as u64);
         hide_if_quiet(&bar);
-        let template = "{prefix} {wide_bar} {pos}/{len} [{elapsed} < {eta}]";
-        if let Ok(style) = ProgressStyle::with_template(template) {
-            bar.set_style(style);
-        }
+        set_style(&bar, "{prefix} {wide_bar} {pos}/{len} [{elapsed}{left}]");
         bar.set_prefix(name.to_owned());
         self.timed(name, &bar, work)
     }
@@ -88,10 +85,7 @@ impl Progress {
     ) -> Result<T, E> {
         let bar = ProgressBar::new(FRACTION_STEPS);
         hide_if_quiet(&bar);
-        let template = "{prefix}: {msg} {wide_bar} {percent} % [{elapsed} < {eta}]";
-        if let Ok(style) = ProgressStyle::with_template(template) {
-            bar.set_style(style);
-        }
+        set_style(&bar, "{prefix}: {msg} {wide_bar} {percent} % [{elapsed}{left}]");
         bar.set_prefix(name.to_owned());
         self.timed(name, &bar, work)
     }
@@ -131,6 +125,20 @@ impl Progress {
     }
 }
 
+/// Gives `bar` the form `template`, whose `{left}` is the time for the rest.
+fn set_style(bar: &ProgressBar, template: &str) {
+    let left = |state: &ProgressState, to: &mut dyn std::fmt::Write| {
+        if let Some(left) = time_left(state.elapsed(), state.pos(), state.len().unwrap_or_default())
+        {
+            // A `String` takes all that is written.
+            let _ = write!(to, ", about {} s left", left.as_secs());
+        }
+    };
+    if let Ok(style) = ProgressStyle::with_template(template) {
+        bar.set_style(style.with_key("left", left));
+    }
+}
+
 fn hide_if_quiet(bar: &ProgressBar) {
     if is_quiet() {
         bar.set_draw_target(ProgressDrawTarget::hidden());
@@ -167,13 +175,20 @@ fn state_of(bar: &ProgressBar) -> String {
     if let Some(length) = bar.length().filter(|n| *n > 0) {
         let percent = 100 * bar.position() / length;
         line = format!("{line}, {percent} %, {}", seconds(bar.elapsed()));
-        if bar.position() > 0 {
-            line = format!("{line}, about {} left", seconds(bar.eta()));
+        if let Some(left) = time_left(bar.elapsed(), bar.position(), length) {
+            line = format!("{line}, about {} left", seconds(left));
         }
     } else {
         line = format!("{line}, {}", seconds(bar.elapsed()));
     }
     line
+}
+
+/// Time for the rest of a work of `length` parts at its mean rate; `None` before the first part is done. The bar's own
+/// estimate weighs the last parts, and grows without bound while a long part goes on.
+fn time_left(elapsed: Duration, done: u64, length: u64) -> Option<Duration> {
+    let rest = length.saturating_sub(done) as f64;
+    (done > 0).then(|| elapsed.mul_f64(rest / done as f64))
 }
 
 /// Moves the bar of [`Progress::fraction`] to a state of the library.
@@ -254,4 +269,25 @@ pub fn mebibytes(bytes: u64) -> String {
 /// Escapes text for HTML, in elements and in attributes with double quotes.
 pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rest_takes_as_long_a_part_as_what_is_done() {
+        let seconds = Duration::from_secs;
+        assert_eq!(time_left(seconds(58), 1, 4), Some(seconds(174)));
+        assert_eq!(time_left(seconds(58), 2, 4), Some(seconds(58)));
+        assert_eq!(time_left(seconds(58), 4, 4), Some(Duration::ZERO));
+        assert_eq!(time_left(seconds(58), 0, 4), None);
+        let bar = ProgressBar::hidden();
+        bar.set_length(1000);
+        bar.set_prefix("scene");
+        bar.set_message("matching");
+        assert_eq!(state_of(&bar), "scene: matching, 0 %, 0 s");
+        bar.set_position(500);
+        assert_eq!(state_of(&bar), "scene: matching, 50 %, 0 s, about 0 s left");
+    }
 }

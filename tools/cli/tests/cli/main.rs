@@ -6,6 +6,7 @@ mod command_line;
 mod convert;
 mod devices;
 mod export;
+mod interrupted;
 mod motion;
 mod photographs_without_cameras;
 mod program;
