@@ -32,14 +32,14 @@ cargo about generate --locked --fail -c tools/release/about.toml -m tools/cli/Ca
 
 # Programs and manual in a folder of the target's own.
 compile() {
-    local target=$1 triple=$2 features=release,jxl${FEATURES:+,$FEATURES}
-    # A window loads its libraries at run time, which a static program cannot.
+    local target=$1 triple=$2 features=release${FEATURES:+,$FEATURES}
+    # GPU and window load their libraries at run time, which a static program cannot.
     [[ $triple == *musl* ]] || features+=,view
     say "$target, features $features …"
     rustup target list --installed 2>/dev/null | grep -qx "$triple" || rustup target add "$triple"
     # shellcheck disable=SC2086 # several words
     CARGO_PROFILE_RELEASE_STRIP=symbols cargo zigbuild --locked --release --target "$target" -p subsplat-cli --bins \
-        --features "$features" ${CARGO_ARGS:-}
+        --no-default-features --features "$features" ${CARGO_ARGS:-}
 }
 
 # Man pages and completions, by the first target's program that runs here.

@@ -58,7 +58,7 @@ async function advice(page) {
   assert.ok(texts.length >= 6, `${texts.length} messages with flags`);
   for (const text of texts) {
     const said = await page.evaluate((text) => advised(text), text);
-    assert.ok(!/--[a-z]/.test(said) && said.length > 20, `${text}\n${said}`);
+    assert.ok(!/--[a-z]/.test(said) && said.length > 5, `${text}\n${said}`);
   }
 }
 
