@@ -95,14 +95,8 @@ function networkText({ processor, reason }) {
   return `The network ran on the processor${reason ? `: ${reason}` : ""}.`;
 }
 
-/** Takes files of a person; `taken`: of the device's camera, where more may follow. */
-function choose(list, taken = false) {
-  const files = [...list];
-  if (files.length === 0) return;
-  // A single file is added to the one before, so that a phone can give them one by one, its camera any number.
-  const one = files.length === 1 && (photographs.length === 1 || taken);
-  const together = one ? [...photographs, ...files] : files;
-  photographs = together.slice(0, PHOTOGRAPHS_MAX);
+/** Shows the photographs that are chosen. */
+function showChosen() {
   const rows = photographs.map((file) => {
     const row = document.createElement("li"), picture = document.createElement("img");
     picture.alt = "";
@@ -113,6 +107,18 @@ function choose(list, taken = false) {
   });
   find("chosen").replaceChildren(...rows);
   find("start").disabled = photographs.length < 2;
+  find("clear").hidden = photographs.length === 0;
+}
+
+/** Takes files of a person; `taken`: of the device's camera, where more may follow. */
+function choose(list, taken = false) {
+  const files = [...list];
+  if (files.length === 0) return;
+  // A single file is added to the one before, so that a phone can give them one by one, its camera any number.
+  const one = files.length === 1 && (photographs.length === 1 || taken);
+  const together = one ? [...photographs, ...files] : files;
+  photographs = together.slice(0, PHOTOGRAPHS_MAX);
+  showChosen();
   const cut = together.length > PHOTOGRAPHS_MAX
     ? `Only the first ${PHOTOGRAPHS_MAX} of ${together.length} photographs are used.` : null;
   showError(cut);
@@ -125,7 +131,7 @@ function busy(state) {
   find("working").hidden = !state;
   find("cancel").hidden = !state;
   find("start").disabled = state || photographs.length < 2;
-  find("files").disabled = find("camera").disabled = state;
+  find("files").disabled = find("camera").disabled = find("clear").disabled = state;
 }
 
 /** Reads the photographs and returns the worker's answer. */
@@ -229,6 +235,12 @@ find("files").addEventListener("change", () => {
 find("camera").addEventListener("change", () => {
   choose(find("camera").files, true);
   find("camera").value = "";
+});
+find("clear").addEventListener("click", () => {
+  photographs = [];
+  showChosen();
+  showError(null);
+  find("news").textContent = "";
 });
 find("cancel").addEventListener("click", () => {
   running.abort(new Error("Cancelled."));

@@ -47,6 +47,27 @@ async function focalLength(page) {
   await page.fill("#focal", "");
 }
 
+/** A phone's camera gives photographs one by one, until a person begins. */
+async function camera(page) {
+  assert.equal(await page.getAttribute("#camera", "capture"), "environment");
+  await page.click("#clear");
+  assert.ok(await page.isDisabled("#start"));
+  for (const [k, says] of [[0, /^One photograph/], [1, /^2 photographs: take another/]]) {
+    await page.setInputFiles("#camera", ROOM[k]);
+    assert.match(await page.textContent("#news"), says);
+  }
+  assert.ok(await page.isEnabled("#start"));
+  assert.equal(await page.locator("#chosen li").count(), 2);
+}
+
+/** Where a browser shares files, the scene goes to other programs as a page. */
+async function shares(page) {
+  await page.click("#share");
+  await page.waitForFunction(() => window.shared);
+  const [name, size] = await page.evaluate(() => [shared.name, shared.size]);
+  assert.ok(name === "scene.html" && size > 1e6, `${name}, ${size} bytes`);
+}
+
 /** No message of the library names a flag of the program. */
 async function advice(page) {
   const skipped = /photos\/(programs|video)|tests?\.rs|verdict\.rs.*poses/;
@@ -89,6 +110,13 @@ export async function testPage() {
         (fractions[stage] ??= new Set()).add(document.getElementById("progress").value);
       }).observe(document.getElementById("progress"), { attributes: true });
     });
+    // Chromium shares nothing on Linux.
+    if (way === "cpu") {
+      await page.evaluate(() => {
+        navigator.canShare = ({ files }) => files.length > 0;
+        navigator.share = async ({ files }) => { window.shared = files[0]; };
+      });
+    }
     const begin = Date.now();
     await chooseFiles(page, ROOM);
     await page.waitForSelector("#working:not([hidden])");
@@ -122,7 +150,9 @@ export async function testPage() {
     if (way === "cpu") {
       await pageOfItsOwn(page);
       await clip(page);
+      await shares(page);
       await focalLength(page);
+      await camera(page);
       await advice(page);
     }
     if (way === "webgl") {
