@@ -6,7 +6,8 @@ mod image;
 
 pub use comment::{
     camera_of_comments, comment_of_camera, comment_of_options, comment_of_origin,
-    comments_without_camera, options_of_comments, origin_of_comments,
+    comment_of_photograph, comments_without_camera, options_of_comments, origin_of_comments,
+    photographs_of_comments,
 };
 pub use device::{DeviceError, Renderer};
 

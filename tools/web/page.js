@@ -9,8 +9,9 @@ const STAGES = {
   "depth range": "estimating the depth range", backbone: "estimating depth",
   primaries: "placing Gaussians", matching: "correcting depth", parents: "adjusting Gaussians",
   subsplat: "dividing Gaussians", detail: "adding detail",
-  fit: "fitting to the photographs", refine: "refining",
+  fit: "fitting to the photographs", refine: "refining", verdict: "judging the scene",
 };
+const TRUST = { good: "Good", near_photographs: "Usable near the photographs", wrong: "Wrong" };
 
 /** `?network=cpu` and `?network=gpu` choose the processor of the network, `?draw=cpu` and
  * `?draw=webgl` that of the pictures. `?size=N` sets the network's input to about N×N pixels. */
@@ -32,6 +33,8 @@ let task = 0;
 const waiting = new Map();
 let viewer = null;
 let photographs = [];
+/** The scene that is shown: its .spz and the viewer's settings. */
+let finished = null;
 
 function stopWorker(reason) {
   worker?.terminate();
@@ -64,9 +67,24 @@ function ask(message, transfer = []) {
   });
 }
 
+/** What messages of the library advise by flags of the program, and the page's controls in their place. */
+const ADVICE = [
+  [/give --fov or --intrinsics/, "fill in the field “Focal length”"],
+  [/give --fov/, "fill in the field “Focal length”"],
+  [/, and give these with --fov 90/, ", and choose these with a focal length of 18 mm"],
+  [/; or build with the feature `heic`/, ""],
+  [/; the program estimates them from the photographs alone, without the file of cameras/, "; other photographs may help"],
+];
+
+/** A message of the library in the page's terms. Advice that the page has no control for is left out. */
+function advised(text) {
+  const said = ADVICE.reduce((said, [flag, control]) => said.replace(flag, control), text);
+  return said.split(/(?=[;:] )/).filter((part) => !/--[a-z]/.test(part)).join("") || said;
+}
+
 function showError(text) {
   find("error").hidden = !text;
-  find("error").textContent = text ?? "";
+  find("error").textContent = advised(text ?? "");
 }
 
 /** Names the processor of the network, and the reason where it is not the first choice. */
@@ -77,12 +95,8 @@ function networkText({ processor, reason }) {
   return `The network ran on the processor${reason ? `: ${reason}` : ""}.`;
 }
 
-function choose(list) {
-  const files = [...list];
-  if (files.length === 0) return;
-  // A single file is added to the one before, so that a phone can give them one by one.
-  const together = files.length === 1 && photographs.length === 1 ? [...photographs, ...files] : files;
-  photographs = together.slice(0, PHOTOGRAPHS_MAX);
+/** Shows the photographs that are chosen. */
+function showChosen() {
   const rows = photographs.map((file) => {
     const row = document.createElement("li"), picture = document.createElement("img");
     picture.alt = "";
@@ -93,18 +107,31 @@ function choose(list) {
   });
   find("chosen").replaceChildren(...rows);
   find("start").disabled = photographs.length < 2;
+  find("clear").hidden = photographs.length === 0;
+}
+
+/** Takes files of a person; `taken`: of the device's camera, where more may follow. */
+function choose(list, taken = false) {
+  const files = [...list];
+  if (files.length === 0) return;
+  // A single file is added to the one before, so that a phone can give them one by one, its camera any number.
+  const one = files.length === 1 && (photographs.length === 1 || taken);
+  const together = one ? [...photographs, ...files] : files;
+  photographs = together.slice(0, PHOTOGRAPHS_MAX);
+  showChosen();
   const cut = together.length > PHOTOGRAPHS_MAX
     ? `Only the first ${PHOTOGRAPHS_MAX} of ${together.length} photographs are used.` : null;
   showError(cut);
   if (photographs.length < 2) find("news").textContent = "One photograph chosen; choose another.";
-  else reconstruct();
+  else if (!taken) reconstruct();
+  else find("news").textContent = `${photographs.length} photographs: take another, or press “Reconstruct”.`;
 }
 
 function busy(state) {
   find("working").hidden = !state;
   find("cancel").hidden = !state;
   find("start").disabled = state || photographs.length < 2;
-  find("files").disabled = state;
+  find("files").disabled = find("camera").disabled = find("clear").disabled = state;
 }
 
 /** Reads the photographs and returns the worker's answer. */
@@ -118,9 +145,38 @@ async function send(signal) {
     task: "reconstruct", module, files,
     options: {
       upscale: find("upscale").value, effort: find("effort").value,
-      size: ADDRESS.get("size") ?? "256", network: ADDRESS.get("network") ?? "auto",
+      size: ADDRESS.get("size") ?? "256", focal: find("focal").value, network: ADDRESS.get("network") ?? "auto",
     },
   }, files.map((f) => f.bytes));
+}
+
+async function attempt(work) {
+  try {
+    await work();
+  } catch (error) {
+    showError(error.message);
+  }
+}
+
+/** The scene as one page with the viewer: what `subsplat export -o scene.html` writes. */
+async function scenePage() {
+  const part = async (name) => {
+    const answer = await fetch(name);
+    if (!answer.ok) throw new Error(`${name} could not be loaded (${answer.status}).`);
+    return answer.text();
+  };
+  const [template, css, js] = await Promise.all(["scene.html", "viewer.css", "viewer.js"].map(part));
+  const { spz, scene: { cameras, background, photographs } } = finished;
+  const url = await new Promise((done) => {
+    const reader = new FileReader();
+    reader.onload = () => done(reader.result);
+    reader.readAsDataURL(new Blob([spz]));
+  });
+  const parts = {
+    title: "scene", css, settings: JSON.stringify({ cameras, background, photographs }).replaceAll("<", "\\u003c"),
+    scene: url.slice(url.indexOf(",") + 1), js,
+  };
+  return new Blob([template.replace(/\{\{(\w+)\}\}/g, (_, name) => parts[name])], { type: "text/html" });
 }
 
 async function reconstruct() {
@@ -141,11 +197,18 @@ async function reconstruct() {
     find("result").hidden = false;
     viewer ??= new SplatViewer(find("viewer"), {
       draw: ADDRESS.get("draw") ?? "auto", levels: ADDRESS.get("levels") !== "off",
+      range: ADDRESS.get("range") !== "off", swing: ADDRESS.get("swing") ?? "auto",
     });
     await viewer.load(spz, scene);
+    finished = { spz, scene };
+    find("clip").hidden = !viewer.canClip();
+    find("share").hidden = !canShare(new File([], "scene.html", { type: "text/html" }));
+    const { trust, reason } = scene.verdict;
+    find("verdict").textContent = `${TRUST[trust]}: ${advised(reason)}.`;
+    find("verdict").dataset.trust = trust;
     const notes = scene.warnings.map((text) => {
       const row = document.createElement("li");
-      row.textContent = text;
+      row.textContent = advised(text);
       return row;
     });
     find("notes").hidden = notes.length === 0;
@@ -169,6 +232,16 @@ find("files").addEventListener("change", () => {
   // The same files can be chosen again.
   find("files").value = "";
 });
+find("camera").addEventListener("change", () => {
+  choose(find("camera").files, true);
+  find("camera").value = "";
+});
+find("clear").addEventListener("click", () => {
+  photographs = [];
+  showChosen();
+  showError(null);
+  find("news").textContent = "";
+});
 find("cancel").addEventListener("click", () => {
   running.abort(new Error("Cancelled."));
   stopWorker("Cancelled.");
@@ -184,6 +257,24 @@ for (const button of document.querySelectorAll("[data-save]")) {
   });
 }
 find("picture").addEventListener("click", () => viewer.savePicture());
+find("page").addEventListener("click", () => attempt(async () => saveBlob(await scenePage(), "scene.html")));
+find("share").addEventListener("click", () => attempt(async () => {
+  const file = new File([await scenePage()], "scene.html", { type: "text/html" });
+  // Whoever closes the list of receivers shares nothing.
+  await navigator.share({ files: [file], title: "scene" }).catch(() => {});
+}));
+find("clip").addEventListener("click", () => attempt(async () => {
+  find("clip").disabled = true;
+  try {
+    const clip = await viewer.clip();
+    saveBlob(clip, `clip.${clip.type.includes("mp4") ? "mp4" : "webm"}`);
+  } finally {
+    find("clip").disabled = false;
+  }
+}));
+document.addEventListener("keydown", (event) => {
+  if (event.key === "Escape" && !event.defaultPrevented) find("notes").open = false;
+});
 const drop = find("drop");
 document.addEventListener("dragover", (event) => {
   event.preventDefault();

@@ -26,7 +26,8 @@ node --no-warnings tools/web/wasi.mjs "$simd/tests.wasm"
 
 [[ -d $place/node_modules/playwright-core ]] ||
     npm install --prefix "$place" --no-audit --no-fund --silent playwright-core@1.65.1
-cp tools/web/test.mjs "$place/test.mjs"
+rm -rf "$place/test"
+cp -r tools/web/test.mjs tools/web/test "$place"
 tools/web/build.sh "$place/site"
 export SUBSPLAT="${CARGO_TARGET_DIR:-target}/release/subsplat"
 exec node "$place/test.mjs" "$@"

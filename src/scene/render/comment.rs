@@ -1,8 +1,8 @@
-//! Rasterizer options and a first camera as comments of a scene file.
+//! Rasterizer options and cameras as comments of a scene file.
 //!
 //! A .ply or .glb file does not state which rules its Gaussians were made for, nor from where they
 //! are to be seen. Convention, near plane, low-pass and background therefore travel as one comment
-//! line, the camera of the first photograph as another.
+//! line, the camera of the first photograph as another, and each photograph's name and camera as one more.
 
 use glam::{DVec3, Mat4};
 use subsplat_kernels::camera::{Camera, Intrinsics};
@@ -27,13 +27,27 @@ pub fn comment_of_options(options: &RasterOptions) -> String {
 /// First words of the comment of a camera.
 const CAMERA_PREFIX: &str = "subsplat camera:";
 
+/// First words of the comment of a photograph.
+const PHOTOGRAPH_PREFIX: &str = "subsplat photograph:";
+
 /// Formats `camera` as a comment for a scene file; [`camera_of_comments`] reads it.
 pub fn comment_of_camera(camera: &Camera) -> String {
+    format!("{CAMERA_PREFIX} {}", text_of_camera(camera))
+}
+
+/// Formats the name and the camera of a photograph that a scene was made from as a comment for a scene
+/// file; [`photographs_of_comments`] reads it. Control characters of the name become spaces.
+pub fn comment_of_photograph(name: &str, camera: &Camera) -> String {
+    let name = name.replace(char::is_control, " ");
+    format!("{PHOTOGRAPH_PREFIX} {} name={name}", text_of_camera(camera))
+}
+
+fn text_of_camera(camera: &Camera) -> String {
     let k = camera.intrinsics();
     let pose = camera.world_from_camera().transpose().to_cols_array();
     let pose: Vec<String> = pose[..12].iter().map(f32::to_string).collect();
     format!(
-        "{CAMERA_PREFIX} size={},{} focal={},{} centre={},{} c2w={}",
+        "size={},{} focal={},{} centre={},{} c2w={}",
         k.width,
         k.height,
         k.fx,
@@ -46,7 +60,20 @@ pub fn comment_of_camera(camera: &Camera) -> String {
 
 /// Reads the camera of a file's comments; `None` where no comment holds a valid one.
 pub fn camera_of_comments(comments: &[String]) -> Option<Camera> {
-    let text = comments.iter().find_map(|c| c.trim().strip_prefix(CAMERA_PREFIX))?;
+    camera_of_text(comments.iter().find_map(|c| c.trim().strip_prefix(CAMERA_PREFIX))?)
+}
+
+/// Reads names and cameras of the photographs in a file's comments, without those that are invalid.
+pub fn photographs_of_comments(comments: &[String]) -> Vec<(String, Camera)> {
+    let texts = comments.iter().filter_map(|c| c.trim().strip_prefix(PHOTOGRAPH_PREFIX));
+    let photograph = |text: &str| {
+        let (camera, name) = text.split_once(" name=")?;
+        Some((name.to_owned(), camera_of_text(camera)?))
+    };
+    texts.filter_map(photograph).collect()
+}
+
+fn camera_of_text(text: &str) -> Option<Camera> {
     let value = |key: &str| text.split_whitespace().find_map(|w| w.strip_prefix(key));
     let numbers = |key: &str| {
         let all = value(key)?.split(',').map(str::parse::<f32>).collect::<Result<Vec<_>, _>>();
@@ -86,7 +113,8 @@ pub fn origin_of_comments(comments: &[String]) -> DVec3 {
 
 /// Leaves out comments that hold in a file's own axes only.
 pub fn comments_without_camera(comments: &[String]) -> Vec<String> {
-    let of_axes = |c: &str| c.starts_with(CAMERA_PREFIX) || c.starts_with(ORIGIN_PREFIX);
+    let prefixes = [CAMERA_PREFIX, PHOTOGRAPH_PREFIX, ORIGIN_PREFIX];
+    let of_axes = |c: &str| prefixes.iter().any(|prefix| c.starts_with(prefix));
     comments.iter().filter(|c| !of_axes(c.trim())).cloned().collect()
 }
 
@@ -165,6 +193,12 @@ mod tests {
         let comments = ["up is -y".to_owned(), comment_of_camera(&camera)];
         assert_eq!(camera_of_comments(&comments), Some(camera));
         assert_eq!(comments_without_camera(&comments), ["up is -y"]);
+        // Names of photographs have spaces, and the first camera is no photograph's.
+        let photograph = comment_of_photograph("a name=b c\n.jpg", &camera);
+        let comments = [photograph, "subsplat photograph: size=1".to_owned()];
+        assert_eq!(photographs_of_comments(&comments), [("a name=b c .jpg".to_owned(), camera)]);
+        assert_eq!(camera_of_comments(&comments), None);
+        assert!(comments_without_camera(&comments).is_empty());
         let good = comment_of_camera(&camera);
         for (from, to) in [
             ("size=256,192", "size=256"),

@@ -12,6 +12,7 @@ use subsplat::files::{SaveOptions, SplatFormat, save_splats};
 use subsplat::finish::reduce;
 use subsplat::scene::render::{
     Renderer, camera_of_comments, comments_without_camera, options_of_comments, origin_of_comments,
+    photographs_of_comments,
 };
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{Convention, RasterOptions};
@@ -35,7 +36,8 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     comments.retain(|comment| !is_own_comment(comment));
     let stored = options_of_comments(&comments);
     let all = splats.len();
-    // cameras.json of `run` holds the views, the comment the first photograph.
+    // The comments of `run` hold the photographs, of older files the first one; cameras.json the views.
+    let photographs = photographs_of_comments(&comments);
     let own = camera_of_comments(&comments);
     let beside = if html || args.gaussians.is_some() {
         render::cameras_beside(
@@ -47,12 +49,11 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     } else {
         None
     };
-    let beside: Option<Vec<Camera>> =
-        beside.map(|all| all.into_iter().map(|(_, camera)| camera).collect());
     if let Some(density) = args.gaussians {
         let options = stored.unwrap_or_else(|| RasterOptions::new(Convention::Standard));
         let count = density.limit(all, 1, 1).max(1);
-        let cameras: Vec<Camera> = beside.iter().flatten().copied().chain(own).collect();
+        let places = beside.iter().flatten().map(|(_, camera)| *camera);
+        let cameras: Vec<Camera> = places.chain(own).collect();
         splats = progress.stage("merging", |_| {
             let renderer = &mut Renderer::default();
             Ok::<_, anyhow::Error>(reduce(&splats, &cameras, &options, count, renderer))
@@ -85,8 +86,17 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             );
         }
         let title = file.file_stem().unwrap_or_default().to_string_lossy();
-        let cameras = beside.unwrap_or_else(|| own.into_iter().collect());
-        let page = Page { splats: &splats, cameras: &cameras, options: &options, title: &title };
+        let given = args.cameras.is_some() && beside.is_some();
+        let from_comments = !given && !photographs.is_empty();
+        let first = || own.into_iter().map(|camera| (String::new(), camera)).collect();
+        let cameras = if from_comments { photographs } else { beside.unwrap_or_else(first) };
+        let page = Page {
+            splats: &splats,
+            cameras: &cameras,
+            photographs: from_comments,
+            options: &options,
+            title: &title,
+        };
         page.write(&args.out, &save)
     })?;
     let kind =

@@ -107,6 +107,13 @@ pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
     cameras_at(through, (0..frames).map(|i| i as f32 / (frames - 1).max(1) as f32 * last))
 }
 
+/// Cameras on the same way from the first to the last and back, slow at both ends.
+pub fn there_and_back(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
+    let last = through.len().saturating_sub(1) as f32;
+    let turn = |i: usize| std::f32::consts::TAU * i as f32 / frames as f32;
+    cameras_at(through, (0..frames).map(|i| last * 0.5 * (1.0 - turn(i).cos())))
+}
+
 /// Cameras on the same way, none of them at a place of `through`.
 pub fn between(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
     let last = through.len().saturating_sub(1) as f32;
@@ -281,6 +288,18 @@ mod tests {
             assert!(Camera::new(path[i].intrinsics(), path[i].world_from_camera()).is_ok());
         }
         assert!(interpolate(&through[..1], 5).is_err());
+    }
+
+    #[test]
+    fn a_clip_goes_to_the_last_camera_and_back() {
+        let through = [camera(0.0, 0.0), camera(1.0, 0.3), camera(3.0, 0.1)];
+        let path = there_and_back(&through, 8).unwrap();
+        let apart = |i: usize, camera: &Camera| path[i].position().distance(camera.position());
+        assert!(apart(0, &through[0]) < 1e-5 && apart(4, &through[2]) < 1e-5);
+        assert!((1..4).all(|i| apart(i, &path[8 - i]) < 1e-5));
+        // Slow at the ends, and the next repetition goes on from the last view.
+        assert!(apart(0, &path[1]) < 0.5 * apart(1, &path[2]));
+        assert!(there_and_back(&through[..1], 8).is_err());
     }
 
     #[test]

@@ -16,7 +16,17 @@ use subsplat_kernels::layout::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOption
 
 const TEMPLATE: &str = include_str!("../../../web/scene.html");
 const STYLE: &str = include_str!("../../../web/viewer.css");
-const VIEWER: &str = include_str!("../../../web/viewer.js");
+/// The files of `tools/web/viewer` in the order of their names.
+const VIEWER: &str = concat!(
+    include_str!("../../../web/viewer/arithmetic.js"),
+    include_str!("../../../web/viewer/cpu.js"),
+    include_str!("../../../web/viewer/gl.js"),
+    include_str!("../../../web/viewer/levels.js"),
+    include_str!("../../../web/viewer/range.js"),
+    include_str!("../../../web/viewer/scene.js"),
+    include_str!("../../../web/viewer/swing.js"),
+    include_str!("../../../web/viewer/viewer.js"),
+);
 
 /// Bytes of a Gaussian with one colour in a .spz: fewer than that have not been seen, and a mean.
 const BYTES_LEAST: usize = 5;
@@ -26,8 +36,10 @@ const BYTES_MEAN: usize = 13;
 pub struct Page<'a> {
     /// The Gaussians.
     pub splats: &'a Splats,
-    /// Places that the viewer offers, its first one first; without any it shows the whole scene.
-    pub cameras: &'a [Camera],
+    /// Names and places that the viewer offers, its first one first; without any it shows the whole scene.
+    pub cameras: &'a [(String, Camera)],
+    /// Whether the cameras are those of the photographs that the scene was made from.
+    pub photographs: bool,
     /// Near plane, low-pass and background of the viewer.
     pub options: &'a RasterOptions,
     /// Title of the page.
@@ -60,6 +72,7 @@ impl Page<'_> {
         let room = most.saturating_sub(rest) / 4 * 3;
         let plain = SaveOptions { sh_degree: Some(0), ..save.clone() };
         let mut count = room / BYTES_MEAN;
+        let cameras: Vec<Camera> = self.cameras.iter().map(|(_, camera)| *camera).collect();
         // More would take the time of an encoding for nothing.
         if self.splats.len() <= room / BYTES_LEAST {
             for save in [save, &plain] {
@@ -71,7 +84,7 @@ impl Page<'_> {
             }
         }
         loop {
-            let fewer = reduce(self.splats, self.cameras, self.options, count, renderer);
+            let fewer = reduce(self.splats, &cameras, self.options, count, renderer);
             let (scene, report) = encoded(&fewer, &plain, path)?;
             if scene.len() <= room || count <= 1 {
                 return self.write_encoded(path, &scene, report);
@@ -113,11 +126,17 @@ impl Page<'_> {
             Convention::Standard => self.options.near,
             Convention::Mvsplat => NEAR_MVSPLAT * self.options.near,
         };
+        let camera = |(name, camera): &(String, Camera)| {
+            let mut value = json!(camera);
+            value["name"] = json!(name);
+            value
+        };
         let settings = json!({
             "background": self.options.background,
             "near": near,
             "lowpass": self.options.lowpass,
-            "cameras": self.cameras,
+            "photographs": self.photographs,
+            "cameras": self.cameras.iter().map(camera).collect::<Vec<_>>(),
         });
         // No text may end the script element.
         settings.to_string().replace('<', "\\u003c")
@@ -151,6 +170,16 @@ mod tests {
     }
 
     #[test]
+    fn the_viewer_has_every_file_of_its_folder_in_order() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../web/viewer");
+        let mut files: Vec<_> =
+            std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
+        files.sort();
+        let joined: String = files.iter().map(|f| std::fs::read_to_string(f).unwrap()).collect();
+        assert!(files.len() > 1 && joined == VIEWER);
+    }
+
+    #[test]
     fn a_page_within_a_limit_keeps_what_fits() {
         use subsplat_kernels::layout::ShBasis;
         // A surface of 60 by 60 Gaussians with colours of degree 1 that no compression shortens.
@@ -167,7 +196,13 @@ mod tests {
         }
         let splats = Splats::new(rows, sh, Vec::new(), 1, ShBasis::Standard).unwrap();
         let options = RasterOptions::new(Convention::Standard);
-        let page = Page { splats: &splats, cameras: &[], options: &options, title: "a" };
+        let page = Page {
+            splats: &splats,
+            cameras: &[],
+            photographs: true,
+            options: &options,
+            title: "a",
+        };
         let place = tempfile::tempdir().unwrap();
         let (path, save) = (place.path().join("a.html"), SaveOptions::default());
         let whole = page.write(&path, &save).unwrap();

@@ -1,6 +1,6 @@
 //! `subsplat render`: renders pictures of a finished scene.
 
-use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderArgs, RenderingArgs, SceneFormatArg};
+use super::args::{LowpassArg, PathArg, RenderArgs, RenderingArgs, SceneFormatArg};
 use super::depth_colour::colour_depth;
 use super::frames::{self, DepthSpread};
 use super::memory;
@@ -225,9 +225,12 @@ fn cameras(
         cameras.into_iter().enumerate().map(|(i, c)| Ok((name(i), sized(c)?))).collect()
     };
     let through: Vec<Camera> = named.iter().map(|(_, c)| *c).collect();
-    let count = args.motion.frames.unwrap_or(PATH_FRAMES);
+    let count = args.motion.path_frames();
     match args.path {
         PathArg::Targets => named.into_iter().map(|(n, c)| Ok((n, sized(c)?))).collect(),
+        PathArg::Interpolate if args.motion.is_clip() => {
+            path(frames::there_and_back(&through, count)?)
+        }
         PathArg::Interpolate => path(frames::interpolate(&through, count)?),
         PathArg::Orbit | PathArg::Spiral | PathArg::Dolly => {
             let shape = args.path.closed().unwrap_or(frames::Loop::Orbit);

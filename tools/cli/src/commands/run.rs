@@ -1,8 +1,6 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
-use super::args::{
-    LowpassArg, PATH_FRAMES, PathArg, RenderingArgs, RunArgs, SceneFormatArg, SourceArgs,
-};
+use super::args::{LowpassArg, PathArg, RenderingArgs, RunArgs, SceneFormatArg, SourceArgs};
 use super::frames::{self, DepthSpread};
 use super::html::Page;
 use super::info::print_left_out;
@@ -23,7 +21,9 @@ use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
 use subsplat::reconstruct::{Assessment, Backend};
 use subsplat::scene::pictures::Rgb;
-use subsplat::scene::render::{comment_of_camera, comment_of_options, comment_of_origin};
+use subsplat::scene::render::{
+    comment_of_camera, comment_of_options, comment_of_origin, comment_of_photograph,
+};
 use subsplat::scene::score::GaussianReport;
 use subsplat::scene::splats::{SplatStatistics, Splats};
 use subsplat::{
@@ -101,9 +101,12 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         output::write_config(&args.out, model.config())?;
         let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
         let origin = comment_of_origin(plan.scene.origin);
-        let cameras: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
+        let name = |i: &usize| plan.scene.frames[*i].name.clone();
+        let places = result.inputs().iter().map(|c| c.target_camera);
+        let cameras: Vec<(String, Camera)> = plan.context.iter().map(name).zip(places).collect();
+        let photographs = cameras.iter().map(|(name, camera)| comment_of_photograph(name, camera));
         let comments = std::iter::once(comment_of_options(&options));
-        let comments = comments.chain(camera).chain(origin).collect();
+        let comments = comments.chain(camera).chain(photographs).chain(origin).collect();
         let save = SaveOptions {
             sh_degree: output::written_degree(args.content.sh, count, degree),
             min_opacity: args.content.min_opacity,
@@ -113,6 +116,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         let page = Page {
             splats: result.splats(),
             cameras: &cameras,
+            photographs: true,
             options: &options,
             title: &plan.scene.name,
         };
@@ -311,11 +315,12 @@ fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Ve
 
 /// Views of a path: few where none was asked for.
 fn path_frames(args: &RunArgs) -> usize {
-    let default = match args.path {
-        PathArg::Targets if args.motion.video.is_none() => UNASKED_FRAMES,
-        _ => PATH_FRAMES,
-    };
-    args.motion.frames.unwrap_or(default)
+    match args.path {
+        PathArg::Targets if args.motion.video.is_none() => {
+            args.motion.frames.unwrap_or(UNASKED_FRAMES)
+        }
+        _ => args.motion.path_frames(),
+    }
 }
 
 fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<Vec<View>> {
@@ -332,6 +337,9 @@ fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<V
         }
         // The photographs themselves show the other views.
         PathArg::Targets if args.motion.video.is_none() => frames::between(&inputs, frames)?,
+        PathArg::Targets | PathArg::Interpolate if args.motion.is_clip() => {
+            frames::there_and_back(&inputs, frames)?
+        }
         PathArg::Targets | PathArg::Interpolate => frames::interpolate(&inputs, frames)?,
     };
     Ok(path.into_iter().map(View::Path).collect())

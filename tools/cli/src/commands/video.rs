@@ -1,8 +1,13 @@
 //! `--video`: the rendered views as an animation.
 //!
 //! .gif and .webp are written here, so that they need no other program: GIF has 256 colours a
-//! frame, WebP all of them without loss. .mp4 (H.264) and .webm (VP9) are ffmpeg's, because no
-//! encoder for them builds on every platform without a C compiler.
+//! frame, WebP all of them without loss (`image` has no other encoder for it). .mp4 (H.264) and .webm (VP9) are
+//! ffmpeg's. With the feature `mp4` the program writes .mp4 itself (`mp4.rs`). It is no default: no well-kept encoder
+//! of H.264 is pure Rust, and OpenH264's 90 files of C++ need a C++ compiler. rav1e (AV1) is pure Rust, compiles
+//! longer than the program, and old phones and chat programs do not play AV1.
+
+#[cfg(feature = "mp4")]
+mod mp4;
 
 use super::args::MotionArgs;
 use crate::report::Answer;
@@ -21,6 +26,8 @@ use subsplat::scene::pictures::Rgb;
 /// which its lossless encoder has 14.
 const GIF_SIDE_MAX: usize = 65_535;
 const WEBP_SIDE_MAX: usize = 16_384;
+/// Bits a second of a clip without --frames: 1.8 MB in 6 seconds.
+const CLIP_BITS: u32 = 2_400_000;
 /// Quantisation of GIF colours, 1 (best) to 30 (fastest).
 const GIF_SPEED: i32 = 10;
 
@@ -51,7 +58,20 @@ enum Encoder {
     Gif(Box<gif::Encoder<BufWriter<File>>>),
     /// Frames of VP8L, one after the other.
     Webp(Vec<Vec<u8>>),
+    #[cfg(feature = "mp4")]
+    Mp4(Box<mp4::Mp4>),
     Ffmpeg(Child),
+}
+
+impl Kind {
+    /// Whether ffmpeg encodes this kind.
+    fn is_of_ffmpeg(self) -> bool {
+        match self {
+            Self::Gif | Self::Webp => false,
+            Self::Mp4 => cfg!(not(feature = "mp4")),
+            Self::Webm => true,
+        }
+    }
 }
 
 fn kind(path: &Path) -> Result<Kind> {
@@ -73,7 +93,7 @@ fn kind(path: &Path) -> Result<Kind> {
 /// # Errors
 /// An unknown extension; .mp4 or .webm without ffmpeg; no folder of that name.
 pub fn check(path: &Path) -> Result<()> {
-    if matches!(kind(path)?, Kind::Mp4 | Kind::Webm) {
+    if kind(path)?.is_of_ffmpeg() {
         ensure!(
             is_installed("ffmpeg"),
             "--video {}: .mp4 and .webm need the program ffmpeg, which was not found; install it, or \
@@ -93,7 +113,11 @@ pub fn push(video: &mut Option<Video>, args: &MotionArgs, view: &Rgb) -> Result<
     let Some(path) = &args.video else { return Ok(()) };
     let video = match video {
         Some(video) => video,
-        None => video.insert(Video::create(path, (view.width, view.height), Rate(args.fps))?),
+        None => {
+            let size = (view.width, view.height);
+            let bits = args.is_clip().then_some(CLIP_BITS);
+            video.insert(Video::create_within(path, size, Rate(args.fps), bits)?)
+        }
     };
     video.push(view)
 }
@@ -114,6 +138,16 @@ impl Video {
     /// # Errors
     /// Those of [`check`]; sides beyond the format's; system errors.
     pub fn create(path: &Path, size: (usize, usize), rate: Rate) -> Result<Self> {
+        Self::create_within(path, size, rate, None)
+    }
+
+    /// Begins an animation that takes about `bits` a second at most, where its format can (.mp4, .webm).
+    fn create_within(
+        path: &Path,
+        size: (usize, usize),
+        rate: Rate,
+        bits: Option<u32>,
+    ) -> Result<Self> {
         check(path)?;
         let (w, h) = size;
         let kind = kind(path)?;
@@ -138,7 +172,12 @@ impl Video {
                 Encoder::Gif(Box::new(encoder))
             }
             Kind::Webp => Encoder::Webp(Vec::new()),
-            Kind::Mp4 | Kind::Webm => Encoder::Ffmpeg(ffmpeg(kind, &part, size, rate)?),
+            #[cfg(feature = "mp4")]
+            Kind::Mp4 => {
+                let file = mp4::Mp4::create(&part, size, rate.0, bits);
+                Encoder::Mp4(Box::new(file.with_context(|| path.display().to_string())?))
+            }
+            _ => Encoder::Ffmpeg(ffmpeg(kind, &part, size, rate, bits)?),
         };
         Ok(Self { path: path.to_owned(), part, size, rate, encoder, frames: 0 })
     }
@@ -174,6 +213,8 @@ impl Video {
                 )?;
                 frames.push(bitstream(&still)?.to_vec());
             }
+            #[cfg(feature = "mp4")]
+            Encoder::Mp4(file) => file.push(frame)?,
             Encoder::Ffmpeg(child) => {
                 let written = child.stdin.as_mut().map(|pipe| pipe.write_all(&frame.data));
                 if !matches!(written, Some(Ok(()))) {
@@ -198,6 +239,8 @@ impl Video {
                 std::fs::write(&self.part, file)
                     .with_context(|| self.path.display().to_string())?;
             }
+            #[cfg(feature = "mp4")]
+            Encoder::Mp4(file) => file.finish()?,
             Encoder::Ffmpeg(child) => {
                 drop(child.stdin.take());
                 if !child.wait()?.success() {
@@ -229,10 +272,24 @@ impl Video {
 }
 
 /// Starts ffmpeg, which reads raw RGB.
-fn ffmpeg(kind: Kind, part: &Path, (w, h): (usize, usize), rate: Rate) -> Result<Child> {
+fn ffmpeg(
+    kind: Kind,
+    part: &Path,
+    (w, h): (usize, usize),
+    rate: Rate,
+    bits: Option<u32>,
+) -> Result<Child> {
     let codec: &[&str] = match kind {
-        Kind::Webm => &["-c:v", "libvpx-vp9", "-crf", "24", "-b:v", "0", "-f", "webm"],
+        Kind::Webm => &["-c:v", "libvpx-vp9", "-crf", "24", "-f", "webm"],
         _ => &["-c:v", "libx264", "-crf", "16", "-movflags", "+faststart", "-f", "mp4"],
+    };
+    let limits: Vec<String> = match (kind, bits) {
+        (Kind::Webm, bits) => vec!["-b:v".to_owned(), bits.unwrap_or(0).to_string()],
+        (_, Some(bits)) => ["-maxrate", "-bufsize"]
+            .into_iter()
+            .flat_map(|name| [name.to_owned(), bits.to_string()])
+            .collect(),
+        (_, None) => Vec::new(),
     };
     Command::new("ffmpeg")
         .args(["-hide_banner", "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"])
@@ -243,6 +300,7 @@ fn ffmpeg(kind: Kind, part: &Path, (w, h): (usize, usize), rate: Rate) -> Result
         .args(["-pix_fmt", "yuv420p", "-colorspace", "bt709", "-color_primaries", "bt709"])
         .args(["-color_trc", "bt709"])
         .args(codec)
+        .args(limits)
         .arg(part)
         .stdin(Stdio::piped())
         .stdout(Stdio::null())

@@ -10,7 +10,7 @@ use crate::failure;
 use crate::report::{Answer, mebibytes, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result, ensure};
 use args::Args;
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 use numbers::Float;
 use plan::Plan;
 use serde_json::{Value, json};
@@ -24,6 +24,11 @@ use subsplat::network::config::Config;
 
 /// Names that are printed of each list; `--json` has all of them.
 const NAMES_PRINTED: usize = 3;
+
+/// The program's command line, from which its man page is made.
+pub fn command() -> clap::Command {
+    Args::command()
+}
 
 /// Runs the program with the process's arguments and returns its exit code.
 pub fn main() -> ExitCode {

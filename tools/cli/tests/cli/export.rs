@@ -59,22 +59,34 @@ fn run_writes_a_page_with_its_scene_and_cameras() {
     let cameras = settings["cameras"].as_array().unwrap();
     assert_eq!(cameras.len(), 2);
     assert_eq!(cameras[0]["width"], 128);
+    assert_eq!(settings["photographs"], true);
+    let names = |settings: &serde_json::Value| -> Vec<String> {
+        let name = |camera: &serde_json::Value| camera["name"].as_str().unwrap().to_owned();
+        settings["cameras"].as_array().unwrap().iter().map(name).collect()
+    };
+    assert_eq!(names(&settings), ["view0", "view2"]);
     assert!(settings["background"][0].as_f64().unwrap() > 0.0);
 
-    // `export` finds scene.ply and cameras.json in the folder that `run` wrote.
+    // `export` finds scene.ply in the folder that `run` wrote, and the photographs' cameras in it.
     let called = call_in(place.path(), "--json export out -o again.html");
     assert_eq!(called.code, 0, "{}", called.stderr);
     let (again, settings) = scene_of(&place.path().join("again.html"));
     assert_eq!(again.len(), splats.len());
-    assert_eq!(settings["cameras"].as_array().unwrap().len(), 1);
+    assert_eq!(names(&settings), ["view0", "view2"]);
+    assert_eq!(settings["photographs"], true);
     assert_eq!(settings["near"].as_f64().unwrap() as f32, 0.01);
+    // Other cameras on request: those of the rendered views.
+    let other = "export out --cameras out/cameras.json -o other.html";
+    assert_eq!(call_in(place.path(), other).code, 0);
+    let (_, settings) = scene_of(&place.path().join("other.html"));
+    assert_eq!((names(&settings).len(), &settings["photographs"]), (1, &false.into()));
 
-    // Alone, the file still knows the first photograph's camera; turned, it does not.
+    // Alone, the file still knows the photographs' cameras; turned, it does not.
     let alone = place.path().join("alone");
     std::fs::create_dir(&alone).unwrap();
     std::fs::copy(place.path().join("out/scene.ply"), alone.join("a.ply")).unwrap();
     for (arguments, cameras) in
-        [("export alone/a.ply -o b.html", 1), ("export alone/turned.ply -o b.html", 0)]
+        [("export alone/a.ply -o b.html", 2), ("export alone/turned.ply -o b.html", 0)]
     {
         let turn = "export alone/a.ply -o alone/turned.ply --up z";
         assert_eq!(call_in(place.path(), turn).code, 0);

@@ -95,7 +95,7 @@ fn animations_are_refused_before_the_work() {
         assert!(called.stderr.contains(words), "{arguments}: {}", called.stderr);
     }
     assert!(!place.path().join("out").exists(), "nothing was rendered");
-    let all = ["render", "one.ply", "--video", "a.mp4"];
+    let all = ["render", "one.ply", "--video", "a.webm"];
     let called = call_with(place.path(), &all, &[("PATH", "/nonexistent")]);
     assert!(called.error().contains("need the program ffmpeg"), "{}", called.stderr);
 }
@@ -109,40 +109,54 @@ fn stand_in(folder: &Path, body: &str) {
     std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o755)).unwrap();
 }
 
+/// Ending and codec of a video that ffmpeg writes.
+#[cfg(unix)]
+const OF_FFMPEG: (&str, &str) =
+    if cfg!(feature = "mp4") { ("webm", "libvpx-vp9") } else { ("mp4", "libx264") };
+
 #[cfg(unix)]
 #[test]
 fn ffmpeg_gets_every_frame() {
+    let (kind, codec) = OF_FFMPEG;
+    let file = format!("a.{kind}");
     let place = workplace();
     save_one_splat(&place.path().join("one.ply"));
     let bin = place.path().join("bin");
     std::fs::create_dir(&bin).unwrap();
     let path = format!("{}:{}", bin.display(), std::env::var("PATH").unwrap());
-    let all: Vec<&str> = "--json render one.ply --path orbit --frames 3 --size 20x10 --video a.mp4"
-        .split(' ')
-        .collect();
+    let command = "--json render one.ply --path orbit --size 20x10 --frames 3 --video";
+    let all: Vec<&str> = command.split(' ').chain([file.as_str()]).collect();
     let keep = r#"[ "$1" = -version ] && exit 0; for last; do :; done; echo "$@" > arguments; cat > "$last""#;
     stand_in(&bin, keep);
     let called = call_with(place.path(), &all, &[("PATH", &path)]);
     assert_eq!(called.code, 0, "{}", called.stderr);
-    let written = std::fs::read(place.path().join("a.mp4")).unwrap();
+    let written = std::fs::read(place.path().join(&file)).unwrap();
     assert_eq!(written.len(), 3 * 20 * 10 * 3);
     let still = load(place.path().join("out/path_0002.png")).unwrap();
     assert!(written.ends_with(&still.data));
     let arguments = std::fs::read_to_string(place.path().join("arguments")).unwrap();
-    for expected in ["-pix_fmt rgb24 -s 20x10 -r 25 -i -", "libx264", "-f mp4"] {
+    for expected in ["-pix_fmt rgb24 -s 20x10 -r 25 -i -", codec, &format!("-f {kind}")] {
         assert!(arguments.contains(expected), "{arguments}");
     }
+    assert!(!arguments.contains("2400000"), "{arguments}");
+
+    // A clip of the default length takes 6 seconds and has a limit.
+    let clip: Vec<&str> = all.iter().copied().filter(|a| !["--frames", "3"].contains(a)).collect();
+    let called = call_with(place.path(), &clip, &[("PATH", &path)]);
+    assert_eq!(called.json()["video"]["frames"], 150, "{}", called.stderr);
+    let arguments = std::fs::read_to_string(place.path().join("arguments")).unwrap();
+    assert!(arguments.contains("2400000"), "{arguments}");
 
     // Its message is the error, and no half of a file stays.
     stand_in(
         &bin,
         r#"[ "$1" = -version ] && exit 0; cat > /dev/null; echo "no such codec" >&2; exit 1"#,
     );
-    std::fs::remove_file(place.path().join("a.mp4")).unwrap();
+    std::fs::remove_file(place.path().join(&file)).unwrap();
     let called = call_with(place.path(), &all[1..], &[("PATH", &path)]);
     assert_eq!(called.code, 1);
     assert!(called.error().contains("ffmpeg failed: no such codec"), "{}", called.stderr);
-    assert!(!place.path().join("a.mp4").exists());
+    assert!(!place.path().join(&file).exists());
 }
 
 #[test]

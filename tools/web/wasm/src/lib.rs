@@ -68,9 +68,10 @@ pub extern "C" fn add_photograph(name_length: usize) -> u32 {
 
 /// Finds the cameras of the photographs and reconstructs their scene. Input: JSON with the texts
 /// `upscale` (1 to 8), `effort` (0: the network alone; 1: fitted to the photographs; 2: refined too),
-/// `size` (side of a square with as many pixels as the network's input) and `network` (the device:
-/// `auto`, `cpu` or `gpu`). Where the device cannot be opened, the CPU does the work. Answer: JSON
-/// with `gaussians`, `background`, `cameras`, `warnings` and `network`.
+/// `size` (side of a square with as many pixels as the network's input), `network` (the device:
+/// `auto`, `cpu` or `gpu`) and `focal` (focal length as of 35 mm film, mm; may be empty). Where the device cannot be
+/// opened, the CPU does the work. Answer: JSON with `gaussians`, `background`, `cameras` (of the photographs, with a
+/// `name`), `verdict` (`trust`, `reason`), `warnings` and `network`.
 #[unsafe(no_mangle)]
 pub extern "C" fn reconstruct() -> u32 {
     answer(|session, request| session.reconstruct(&request))

@@ -4,11 +4,11 @@ use crate::host;
 use serde_json::{Value, json};
 use std::ops::{ControlFlow, RangeInclusive};
 use std::path::Path;
-use subsplat::EstimateOptions;
+use subsplat::scene::render::comment_of_photograph;
 use subsplat::{
-    Backend, Camera, DeviceChoice, FitOptions, LoadOptions, Options, Photo, Photograph,
-    RasterOptions, Reconstructor, Refine, SaveOptions, SplatFormat, Splats, Warning, encode_splats,
-    estimate_cameras, parse_photograph,
+    Backend, Camera, DeviceChoice, EstimateOptions, FitOptions, KnownLens, LoadOptions, Options,
+    Photo, Photograph, RasterOptions, Reconstruction, Reconstructor, Refine, Renderer, SaveOptions,
+    SplatFormat, Splats, Warning, encode_splats, estimate_cameras, parse_photograph,
 };
 
 /// Reports a stage to the page.
@@ -28,8 +28,11 @@ struct Scene {
     options: RasterOptions,
     /// Lines for the header of a .ply or .glb.
     comments: Vec<String>,
-    cameras: Vec<Camera>,
+    /// Names and cameras of the photographs.
+    cameras: Vec<(String, Camera)>,
     warnings: Vec<String>,
+    /// JSON of the verdict: `trust` and `reason`.
+    verdict: Value,
     network: Network,
 }
 
@@ -43,6 +46,8 @@ struct Request {
     size: usize,
     /// The network's device.
     network: String,
+    /// Focal length of the photographs as of 35 mm film, mm; `None` leaves it to them.
+    focal: Option<f32>,
 }
 
 impl Request {
@@ -60,8 +65,28 @@ impl Request {
             effort: number("effort", 0..=2)?,
             size: number("size", 32..=1024)?,
             network: text("network"),
+            focal: Some(text("focal")).filter(|text| !text.is_empty()).map(focal).transpose()?,
         })
     }
+}
+
+/// Shortest and longest focal length that a person may give, mm of 35 mm film.
+const FOCAL_MM: [f32; 2] = [8.0, 400.0];
+/// Diagonal of a photograph on 35 mm film, mm.
+const FILM_DIAGONAL_MM: f32 = 43.27;
+
+fn focal(text: String) -> Result<f32, String> {
+    let [least, most] = FOCAL_MM;
+    let found = text.parse::<f32>().ok().filter(|mm| (least..=most).contains(mm));
+    found.ok_or_else(|| format!("Focal length: expected {least} to {most} mm, got {text:?}"))
+}
+
+/// The lens of a focal length as of 35 mm film, which the diagonal defines, for photographs of the size of the first.
+fn lens(focal_mm: f32, photographs: &[(String, Photograph)]) -> Option<KnownLens> {
+    let image = &photographs.first()?.1.image;
+    let (width, height) = (image.width as f32, image.height as f32);
+    let focal_px = focal_mm * width.hypot(height) / FILM_DIAGONAL_MM;
+    Some(KnownLens::FovX(2.0 * (0.5 * width / focal_px).atan()))
 }
 
 /// Processor that ran the network.
@@ -104,7 +129,8 @@ impl Session {
         self.scene = None;
         let photographs = std::mem::take(&mut self.photographs);
         let request = Request::parse(request)?;
-        let (photos, mut warnings) = with_cameras(photographs)?;
+        let lens = request.focal.and_then(|focal| lens(focal, &photographs));
+        let Found { photos, names, mut warnings } = with_cameras(photographs, lens)?;
         let mut options = Options::default().with_input_area(request.size * request.size);
         match request.effort {
             0 => options = options.with_fit(FitOptions::off()).with_refine(Refine::Off),
@@ -130,10 +156,14 @@ impl Session {
         reason = of_gpu.last().map(Warning::to_string).or(reason);
         warnings.extend(Warning::sentences(&rest));
         let processor = if backend.is_cpu() { "cpu" } else { "gpu" };
+        let places = result.inputs().iter().map(|c| c.target_camera);
+        let cameras: Vec<(String, Camera)> = names.into_iter().zip(places).collect();
+        let photographs = cameras.iter().map(|(name, camera)| comment_of_photograph(name, camera));
         self.scene = Some(Scene {
             options: *result.raster_options(),
-            comments: result.comments(),
-            cameras: result.inputs().iter().map(|c| c.target_camera).collect(),
+            comments: result.comments().into_iter().chain(photographs).collect(),
+            cameras,
+            verdict: verdict(&result)?,
             splats: result.into_splats(),
             warnings,
             network: Network { processor, reason },
@@ -150,7 +180,9 @@ impl Session {
         Ok(bytes(&json!({
             "gaussians": scene.splats.len(),
             "background": scene.options.background,
-            "cameras": scene.cameras,
+            "cameras": scene.cameras.iter().map(named_camera).collect::<Vec<_>>(),
+            "photographs": true,
+            "verdict": scene.verdict,
             "warnings": scene.warnings,
             "network": {
                 "processor": scene.network.processor,
@@ -169,6 +201,19 @@ impl Session {
     }
 }
 
+/// Judges a scene by its photographs.
+fn verdict(result: &Reconstruction) -> Result<Value, String> {
+    report("verdict", 0.0);
+    let judged = result.assess(&mut Renderer::default(), result.raster_options());
+    Ok(json!(judged.map_err(|e| e.to_string())?.verdict))
+}
+
+fn named_camera((name, camera): &(String, Camera)) -> Value {
+    let mut value = json!(camera);
+    value["name"] = json!(name);
+    value
+}
+
 /// Opens `device` (`auto`, `cpu` or `gpu`). Returns the CPU and the reason where that fails.
 fn open(device: &str) -> (Backend, Option<String>) {
     host::allow_waiting();
@@ -179,17 +224,30 @@ fn open(device: &str) -> (Backend, Option<String>) {
     }
 }
 
-/// Estimates the cameras of photographs. Photographs without one are left out, with a warning.
+/// Photographs with cameras, their names without extensions, and warnings.
+struct Found {
+    photos: Vec<Photo>,
+    names: Vec<String>,
+    warnings: Vec<String>,
+}
+
+/// Estimates the cameras of photographs, all of `lens` where it is known. Photographs without one are left out, with a
+/// warning.
 fn with_cameras(
     photographs: Vec<(String, Photograph)>,
-) -> Result<(Vec<Photo>, Vec<String>), String> {
+    lens: Option<KnownLens>,
+) -> Result<Found, String> {
     let (names, photographs): (Vec<String>, Vec<Photograph>) = photographs.into_iter().unzip();
     let mut warnings: Vec<String> = photographs.iter().flat_map(|p| p.warnings.clone()).collect();
     report("cameras", 0.0);
-    let found = estimate_cameras(photographs, &EstimateOptions::default())
-        .map_err(|error| error.to_string())?;
+    let options = EstimateOptions { lens, ..EstimateOptions::default() };
+    let found = estimate_cameras(photographs, &options).map_err(|error| error.to_string())?;
     let estimate = &found.estimate;
     warnings.extend(estimate.left_out_sentences(|photo| names[photo].clone()));
     warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
-    Ok((found.photos, warnings))
+    let placed = names.iter().zip(&estimate.cameras).filter(|(_, camera)| camera.is_some());
+    let stem =
+        |name: &String| Path::new(name).file_stem().map(|s| s.to_string_lossy().into_owned());
+    let names = placed.map(|(name, _)| stem(name).unwrap_or_default()).collect();
+    Ok(Found { photos: found.photos, names, warnings })
 }

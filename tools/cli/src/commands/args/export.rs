@@ -47,7 +47,8 @@ pub struct ExportArgs {
     pub gaussians: Option<Density>,
     /// Cameras of the scene: the .html starts from them, and --gaussians keeps what they show.
     ///
-    /// A pose file of any kind or a scene folder. Default: cameras.json beside the scene, else the camera that the file holds, else none.
+    /// A pose file of any kind or a scene folder. Default: for .html the photographs' cameras, where the file holds them
+    /// (.ply and .glb of `run`); else cameras.json beside the scene, else the camera that the file holds, else none.
     #[arg(long, value_name = "SCENE")]
     pub cameras: Option<PathBuf>,
     /// Up direction of a .ply, .sog or .splat (default: keep).

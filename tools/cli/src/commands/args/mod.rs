@@ -24,7 +24,7 @@ pub use files::{ContentArgs, SceneFormatArg};
 pub use info::InfoArgs;
 pub use poses::PosesArgs;
 pub use render::RenderArgs;
-pub use rendering::{ConventionArg, LowpassArg, MotionArgs, PATH_FRAMES, PathArg, RenderingArgs};
+pub use rendering::{ConventionArg, LowpassArg, MotionArgs, PathArg, RenderingArgs};
 pub use run::{PictureSizeArg, RunArgs};
 pub use source::{
     BackboneArg, CropShapeArg, DetailArg, InputSizeArg, MatchingArg, ModelArgs, PresetArg,

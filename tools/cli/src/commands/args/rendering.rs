@@ -7,7 +7,9 @@ use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
 /// Number of views of a path that is asked for.
-pub const PATH_FRAMES: usize = 30;
+const PATH_FRAMES: usize = 30;
+/// Seconds of a --video without --frames.
+const CLIP_SECONDS: usize = 6;
 
 /// The rules of a rasterizer.
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -69,8 +71,9 @@ impl PathArg {
 pub struct MotionArgs {
     /// Number of views of a --path.
     ///
-    /// Default: 30; 3 for `run` without --path and without photographs to compare with. Of a video, without --path and
-    /// --video: the most frames to take from it, as --take.
+    /// Default: 30; with --video 6 seconds, from the first camera to the last and back; 3 for `run` without --path and
+    /// without photographs to compare with. Of a video, without --path and --video: the most frames to take from it, as
+    /// --take.
     #[arg(long, value_name = "N", value_parser = values::frames, help_heading = PICTURES)]
     pub frames: Option<usize>,
     /// Radius of --path orbit, spiral and dolly, in the unit of the cameras' positions.
@@ -88,7 +91,8 @@ pub struct MotionArgs {
     pub orbit_radius: Option<f32>,
     /// File for the views as an animation: .gif, .webp, .mp4 or .webm.
     ///
-    /// .gif and .webp need no other program; .mp4 and .webm need ffmpeg.
+    /// Without --frames it takes 6 seconds, and as .mp4 or .webm at most about 2 MB. .gif and .webp need no other
+    /// program, .mp4 none in builds with the feature `mp4`; else .mp4 and .webm need ffmpeg.
     #[arg(long, value_name = "FILE", help_heading = PICTURES)]
     pub video: Option<PathBuf>,
     /// Views a second in --video.
@@ -101,6 +105,19 @@ pub struct MotionArgs {
         help_heading = PICTURES
     )]
     pub fps: u32,
+}
+
+impl MotionArgs {
+    /// Whether these arguments ask for an animation of the default length, which ends where it begins.
+    pub fn is_clip(&self) -> bool {
+        self.video.is_some() && self.frames.is_none()
+    }
+
+    /// Number of views of a path that is asked for.
+    pub fn path_frames(&self) -> usize {
+        let default = if self.is_clip() { CLIP_SECONDS * self.fps as usize } else { PATH_FRAMES };
+        self.frames.unwrap_or(default)
+    }
 }
 
 /// Rendering options.
