@@ -36,6 +36,7 @@ def test_a_scene_renders_what_rasterize_does():
     assert np.array_equal(picture.alpha, got.alphas[0, ..., 0])
     assert np.allclose(picture.depth, got.depths[0, ..., 0], rtol=1e-6)
     assert picture.to_uint8().dtype == np.uint8 and len(scene) == 50
+    assert scene.verdict is None
 
 
 def test_cameras_give_their_matrices_back():
@@ -109,8 +110,13 @@ def test_photographs_become_a_scene(tmp_path):
     names = [stage for stage, _ in stages]
     assert "estimating the cameras" in names and len(set(names)) > 4
     assert all(0 <= fraction <= 1 for _, fraction in stages)
+    assert scene.verdict.trust in ("good", "near_photographs")
+    assert str(scene.verdict).endswith(scene.verdict.reason)
     scene.save(tmp_path / "berlin.html")
-    assert (tmp_path / "berlin.html").stat().st_size > 100_000
+    whole = (tmp_path / "berlin.html").stat().st_size
+    assert whole > 150_000
+    scene.save(tmp_path / "berlin.html", page_bytes=whole - 50_000)
+    assert 100_000 < (tmp_path / "berlin.html").stat().st_size <= whole - 50_000
     splats = scene.splats
     again = subsplat.rasterize(
         *splats[:4], splats.sh, scene.cameras[0].viewmat[None], scene.cameras[0].K[None],

@@ -22,7 +22,7 @@ from .photographs import (
     reconstruct,
 )
 from .raster import Rasterized, rasterize, rasterize_backward
-from .scene import Picture, Scene, Splats, convert, load
+from .scene import Picture, Scene, Splats, Verdict, convert, load
 
 __all__ = [
     "Camera",
@@ -32,6 +32,7 @@ __all__ = [
     "Rasterized",
     "Scene",
     "Splats",
+    "Verdict",
     "check",
     "convert",
     "estimate_cameras",

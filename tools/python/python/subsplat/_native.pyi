@@ -46,6 +46,8 @@ class Scene:
     @property
     def cameras(self) -> list[Camera]: ...
     @property
+    def verdict(self) -> Optional[tuple[str, str, str]]: ...
+    @property
     def warnings(self) -> list[str]: ...
     def overview(self, side: int) -> Camera: ...
     def splats(self) -> dict[str, Floats]: ...
@@ -58,6 +60,7 @@ class Scene:
         sh_degree: Optional[int],
         min_opacity: float,
         up: str,
+        page_bytes: Optional[int],
     ) -> None: ...
 
 def rasterize(
@@ -88,6 +91,7 @@ def reconstruct(
     gaussians: Optional[int],
     refine_seconds: Optional[int],
     upscale: int,
+    adjust_poses: bool,
     weights: Optional[str | PathLike[str]],
     progress: Progress,
 ) -> Scene: ...

@@ -58,16 +58,19 @@ def reconstruct(
     gaussians: Optional[int] = None,
     refine_seconds: Optional[int] = None,
     upscale: int = 2,
+    adjust_poses: bool = False,
     weights: Optional[Path] = None,
     progress: Progress = None,
 ) -> Scene:
     """Makes a scene of two or more photographs of one place.
 
-    photos: a folder of photographs, or of a scene with cameras (COLMAP, transforms.json, cameras.json, …); or a
-    list of paths, PIL pictures and uint8 arrays [H, W, 3].
+    photos: a folder of photographs, or of a scene with cameras (COLMAP, transforms.json, cameras.json, …), of
+    which at most 12 photographs that overlap are used (6 at "high" and "best"); or a list of paths, PIL pictures
+    and uint8 arrays [H, W, 3], of which all are used.
     cameras: one for each photograph of a list. Without, the cameras are estimated.
     quality: "fast", "normal", "high" or "best". gaussians: at most this number. refine_seconds: time of the
-    refinement, 0 for none. upscale: 1 to 8, Gaussians per input pixel and side. weights: a file of weights.
+    refinement, 0 for none. upscale: 1 to 8, Gaussians per input pixel and side. adjust_poses: corrects cameras that
+    are nearly right. weights: a file of weights.
     progress: a function of a stage (text) and the share that is done (0 to 1); True shows a bar (tqdm).
 
     Ctrl-C stops the call. Raises ValueError where the photographs do not determine their cameras, and OSError
@@ -76,7 +79,7 @@ def reconstruct(
     with _Bar(progress) as report:
         native = _native.reconstruct(
             _photos(photos), _cameras(cameras), quality, gaussians, refine_seconds, upscale,
-            None if weights is None else os.fspath(weights), report,
+            adjust_poses, None if weights is None else os.fspath(weights), report,
         )
     return Scene._of(native)
 
@@ -95,7 +98,7 @@ def check(
 ) -> list[dict[str, Any]]:
     """Checks whether cameras fit their photographs, by points that consecutive photographs share.
 
-    photos and cameras: as of `reconstruct`. Returns a dictionary for each pair: ``verdict`` ("ok", "warning" or
+    photos and cameras: as of `reconstruct` at "normal". Returns a dictionary for each pair: ``verdict`` ("ok", "warning" or
     "bad"), ``findings`` (each with ``severity``, ``code`` and ``sentence``), ``matches``, ``overlap``, … .
     """
     with _Bar(progress) as report:
