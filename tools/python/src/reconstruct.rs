@@ -3,6 +3,7 @@
 use crate::arrays::array;
 use crate::camera::Camera;
 use crate::error;
+use crate::numbers::{optional_whole, whole};
 use crate::photographs::{Posed, Source, estimate, estimate_of_files};
 use crate::scene::Scene;
 use crate::work;
@@ -11,6 +12,7 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use std::path::PathBuf;
 use subsplat::cameras::estimation::Confidence;
+use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::stages::check_pairs;
 use subsplat::{
     Backend, Density, Error, Options, Photo, Poses, Quality, Reconstructor, Refine, Renderer,
@@ -18,6 +20,9 @@ use subsplat::{
 
 /// Most photographs of a scene with cameras, at `fast` and `normal`, and above: those of `subsplat run`.
 const PHOTOGRAPHS_MAX: [usize; 2] = [12, 6];
+
+/// Longest refinement, seconds.
+const SECONDS_MAX: usize = 1_000_000;
 
 /// Options of a reconstruction.
 struct Request {
@@ -37,9 +42,9 @@ pub(crate) fn reconstruct(
     photos: &Bound<'_, PyAny>,
     cameras: Option<Vec<PyRef<'_, Camera>>>,
     quality: &str,
-    gaussians: Option<usize>,
-    refine_seconds: Option<u32>,
-    upscale: usize,
+    gaussians: Option<&Bound<'_, PyAny>>,
+    refine_seconds: Option<&Bound<'_, PyAny>>,
+    upscale: &Bound<'_, PyAny>,
     adjust_poses: bool,
     weights: Option<PathBuf>,
     progress: Option<&Bound<'_, PyAny>>,
@@ -57,14 +62,15 @@ pub(crate) fn reconstruct(
     if adjust_poses {
         options = options.with_poses(Poses::Adjusted);
     }
-    if let Some(count) = gaussians {
+    if let Some(count) = optional_whole("gaussians", gaussians, 1..=usize::MAX)? {
         options = options.with_density(Density::Count(count));
     }
-    match refine_seconds {
+    match optional_whole("refine_seconds", refine_seconds, 0..=SECONDS_MAX)? {
         None => {}
         Some(0) => options = options.with_refine(Refine::Off),
-        Some(seconds) => options = options.with_refine(Refine::Seconds(seconds)),
+        Some(seconds) => options = options.with_refine(Refine::Seconds(seconds as u32)),
     }
+    let upscale = whole("upscale", upscale, 1..=UPSCALE_MAX)?;
     let request = Request { quality: level, upscale, weights, options };
     work::run(py, progress, move |report| run(source, cameras, request, report))
 }

@@ -1,8 +1,10 @@
 //! The class `Scene`: Gaussians with the rules to render them.
 
-use crate::arrays::{array, borrow, finite};
+use crate::arrays::{array, borrow, check_gaussians, finite};
 use crate::camera::Camera;
 use crate::error;
+use crate::numbers::{misfit, optional_whole, real, whole};
+use crate::raster::SIDES;
 use numpy::PyArrayDyn;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -22,6 +24,8 @@ use subsplat::{
 };
 use subsplat_cli::commands::html::Page;
 
+/// Least size of a page: the viewer alone has a quarter of it.
+const PAGE_BYTES_MIN: usize = 200_000;
 /// Field of view of the camera that sees a whole scene, radians.
 const FOV: f32 = 1.0;
 
@@ -79,6 +83,7 @@ impl Scene {
         ] {
             finite(name, values, row).map_err(PyValueError::new_err)?;
         }
+        check_gaussians(q, o).map_err(PyValueError::new_err)?;
         let mut rows = Vec::with_capacity(SPLAT_STRIDE * n);
         for (i, opacity) in o.iter().enumerate() {
             rows.extend_from_slice(&m[3 * i..3 * i + 3]);
@@ -121,7 +126,8 @@ impl Scene {
     }
 
     /// A camera that sees the whole scene, along +z of the world.
-    fn overview(&self, side: usize) -> PyResult<Camera> {
+    fn overview(&self, side: &Bound<'_, PyAny>) -> PyResult<Camera> {
+        let side = whole("side", side, SIDES)?;
         let Some(bounds) = Bounds::of(self.splats.means()) else {
             return Err(PyValueError::new_err(
                 "overview: expected a scene with Gaussians, got none",
@@ -153,10 +159,19 @@ impl Scene {
     fn render<'py>(
         &self,
         py: Python<'py>,
-        camera: &Camera,
-        background: Option<[f32; 3]>,
+        camera: &Bound<'py, PyAny>,
+        background: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Drawn<'py>> {
-        let background = background.unwrap_or(self.options.background);
+        let Ok(camera) = camera.cast::<Camera>() else {
+            return Err(misfit("camera", "a subsplat.Camera", camera.repr()?));
+        };
+        let camera = camera.get();
+        let background = match background {
+            None => self.options.background,
+            Some(rgb) => rgb
+                .extract::<[f32; 3]>()
+                .or_else(|_| Err(misfit("background", "three numbers", rgb.repr()?)))?,
+        };
         finite("background", &background, 3).map_err(PyValueError::new_err)?;
         let options = RasterOptions { background, ..self.options };
         let k = camera.0.intrinsics();
@@ -174,18 +189,22 @@ impl Scene {
         &self,
         py: Python<'_>,
         path: PathBuf,
-        sh_degree: Option<usize>,
-        min_opacity: f32,
+        sh_degree: Option<&Bound<'_, PyAny>>,
+        min_opacity: &Bound<'_, PyAny>,
         up: &str,
-        page_bytes: Option<usize>,
+        page_bytes: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<()> {
+        let sh_degree = optional_whole("sh_degree", sh_degree, 0..=SH_DEGREE_MAX)?;
+        let min_opacity = real("min_opacity", min_opacity)?;
+        let page_bytes = optional_whole("page_bytes", page_bytes, PAGE_BYTES_MIN..=usize::MAX)?;
         let up = up.parse().map_err(PyValueError::new_err)?;
         if !(0.0..=1.0).contains(&min_opacity) {
             return Err(error::value("min_opacity", "0 to 1", min_opacity));
         }
         let camera = self.cameras.first().map(comment_of_camera);
         let comments = std::iter::once(comment_of_options(&self.options)).chain(camera).collect();
-        let options = SaveOptions { sh_degree, min_opacity, up, comments };
+        let options =
+            SaveOptions { sh_degree, min_opacity, up, comments, ..SaveOptions::default() };
         let html = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("html"));
         py.detach(|| {
             if html {

@@ -210,7 +210,7 @@ print(most() - before, sum(a.nbytes for a in arrays) + sh.nbytes)
 def test_a_call_takes_no_memory_of_the_size_of_its_arrays():
     out = subprocess.run([sys.executable, "-c", COUNT_MEMORY], check=True, capture_output=True, text=True)
     grown, size = map(int, out.stdout.split())
-    assert size > 130e6 and grown < 0.2 * size, f"{grown} bytes for arrays of {size}"
+    assert size > 130e6 and grown < 0.5 * size, f"{grown} bytes for arrays of {size}"
 
 
 def test_outputs_own_their_memory(scene):
@@ -258,7 +258,8 @@ REFUSED = [
     (lambda s: {"opacities": s["opacities"][:, None]}, ValueError, r"opacities: expected shape \[40\]"),
     (lambda s: {"colors": s["colors"][:, :1].copy()}, ValueError, r"colors: expected shape \[40, 3\]"),
     (lambda s: {"sh_degree": 1}, ValueError, r"colors: expected shape \[40, D, 3\]"),
-    (lambda s: {"sh_degree": 7}, ValueError, "sh_degree: expected 0 to 4, got 7"),
+    (lambda s: {"sh_degree": 7}, ValueError, "sh_degree: expected a whole number from 0 to 4, got 7"),
+    (lambda s: {"sh_degree": -1}, ValueError, "sh_degree: expected a whole number from 0 to 4, got -1"),
     (lambda s: {"means": s["means"].astype(np.float64)}, TypeError, "means: expected float32, got float64"),
     (lambda s: {"colors": (s["colors"] * 255).astype(np.uint8)}, TypeError, "colors: expected float32, got uint8"),
     (lambda s: {"means": s["means"].tolist()}, TypeError, r"means: expected a numpy array \[N, 3\] of float32"),
@@ -273,7 +274,12 @@ REFUSED = [
     (lambda s: {"viewmats": s["viewmats"][:0]}, ValueError, "at least one camera"),
     (lambda s: {"Ks": s["Ks"] * np.float32([[-1], [1], [1]])}, ValueError, "camera 0: .*"),
     (lambda s: {"Ks": np.repeat(s["Ks"], 2, 0)}, ValueError, r"Ks: expected shape \[1, 3, 3\]"),
-    (lambda s: {"width": 0}, ValueError, "camera 0: .*size"),
+    (lambda s: {"quats": 0 * s["quats"]}, ValueError, "quats: expected a length above 0, got 0 in entry 0"),
+    (lambda s: {"opacities": s["opacities"] + 1}, ValueError, "opacities: expected 0 to 1, after the sigmoid, got"),
+    (lambda s: {"width": 0}, ValueError, "width: expected a whole number from 1 to 32768, got 0"),
+    (lambda s: {"width": 3.5}, TypeError, "width: expected a whole number from 1 to 32768, got 3.5"),
+    (lambda s: {"height": 2**70}, ValueError, "height: expected a whole number from 1 to 32768"),
+    (lambda s: {"eps2d": "x"}, TypeError, "eps2d: expected a number, got 'x'"),
     (lambda s: {"width": 32768, "height": 32768}, ValueError, "pictures: expected at most"),
     (lambda s: {"near_plane": 0.0}, ValueError, "near_plane: expected a number above 0"),
     (lambda s: {"eps2d": float("nan")}, ValueError, "eps2d: expected"),

@@ -12,6 +12,8 @@ place.
 ``subsplat.torch`` has the rasterizer for tensors. PyTorch is imported when it is first used.
 """
 
+from typing import Any
+
 from ._native import Camera, __version__
 from .photographs import (
     Estimate,
@@ -45,7 +47,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> Any:
     if name == "torch":
         import importlib
 

@@ -1,6 +1,6 @@
 """The native module. Its functions have no defaults; the package's modules document and call them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any, Optional
 
@@ -52,7 +52,7 @@ class Scene:
     def overview(self, side: int) -> Camera: ...
     def splats(self) -> dict[str, Floats]: ...
     def render(
-        self, camera: Camera, background: Optional[tuple[float, float, float]]
+        self, camera: Camera, background: Optional[Sequence[float]]
     ) -> tuple[Floats, Floats, Floats]: ...
     def save(
         self,

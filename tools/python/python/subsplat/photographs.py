@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable
 from typing import Any, Callable, NamedTuple, Optional, Sequence, Union
 
 import numpy as np
@@ -102,13 +103,16 @@ def check(
     "bad"), ``findings`` (each with ``severity``, ``code`` and ``sentence``), ``matches``, ``overlap``, … .
     """
     with _Bar(progress) as report:
-        return json.loads(_native.check(_photos(photos), _cameras(cameras), report))
+        reports = json.loads(_native.check(_photos(photos), _cameras(cameras), report))
+    return list(reports)
 
 
 def _photos(photos: Photos) -> Union[str, list[Any]]:
     """Paths as text, pictures as arrays."""
     if isinstance(photos, (str, os.PathLike)):
         return os.fspath(photos)
+    if not isinstance(photos, Iterable):
+        raise TypeError(f"photos: expected a path or a list of photographs, got {photos!r}")
     return [_photo(photo) for photo in photos]
 
 
@@ -123,7 +127,12 @@ def _photo(photo: Any) -> Any:
 
 
 def _cameras(cameras: Optional[Sequence[Camera]]) -> Optional[list[Camera]]:
-    return None if cameras is None else list(cameras)
+    if cameras is None:
+        return None
+    for camera in cameras:
+        if not isinstance(camera, Camera):
+            raise TypeError(f"cameras: expected subsplat.Camera, got {camera!r}")
+    return list(cameras)
 
 
 class _Bar:
@@ -133,13 +142,13 @@ class _Bar:
         if not (progress is None or isinstance(progress, bool) or callable(progress)):
             raise TypeError(f"progress: expected a function or True, got {progress!r}")
         self._progress = progress
-        self._bar = None
+        self._bar: Any = None
 
     def __enter__(self) -> Optional[Callable[[str, float], Any]]:
         if self._progress is not True:
             return self._progress or None
         try:
-            from tqdm.auto import tqdm
+            from tqdm.auto import tqdm  # type: ignore[import-untyped, unused-ignore]
         except ImportError as missing:
             raise ImportError("progress=True needs tqdm: pip install tqdm") from missing
         self._bar = tqdm(total=100, bar_format="{desc} {percentage:3.0f} %|{bar}| {elapsed}")

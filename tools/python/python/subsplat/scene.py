@@ -126,8 +126,6 @@ class Scene:
         """
         if camera is None:
             camera = next(iter(self.cameras), None) or self.overview()
-        if background is not None:
-            background = tuple(float(v) for v in background)
         return Picture(*self._native.render(camera, background))
 
     def save(
@@ -139,7 +137,7 @@ class Scene:
         up: str = "keep",
         page_bytes: Optional[int] = PAGE_BYTES,
     ) -> None:
-        """Writes a .ply, .glb, .spz or .splat file, or a .html page with a viewer.
+        """Writes a .ply, .glb, .spz, .sog or .splat file, or a .html page with a viewer.
 
         sh_degree: highest degree of colours that is written; None is what the format's readers know.
         min_opacity: Gaussians of a lower opacity are left out. up: "keep" (OpenCV, y down), "y" or "z".
