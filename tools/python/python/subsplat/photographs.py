@@ -69,9 +69,9 @@ def reconstruct(
     which at most 12 photographs that overlap are used (6 at "high" and "best"); or a list of paths, PIL pictures
     and uint8 arrays [H, W, 3], of which all are used.
     cameras: one for each photograph of a list. Without, the cameras are estimated.
-    quality: "fast", "normal", "high" or "best". gaussians: at most this number after the refinement. refine_seconds: time of the
-    refinement, 0 for none. upscale: 1 to 8, Gaussians per input pixel and side. adjust_poses: corrects cameras that
-    are nearly right. weights: a file of weights.
+    quality: "fast", "normal", "high" or "best". gaussians: at most this number after the refinement.
+    refine_seconds: time of the refinement, 0 for none. upscale: 1 to 8, Gaussians per input pixel and side.
+    adjust_poses: corrects cameras that are nearly right. weights: a file of weights.
     progress: a function of a stage (text) and the share that is done (0 to 1); True shows a bar (tqdm).
 
     Ctrl-C stops the call. Raises ValueError where the photographs do not determine their cameras, and OSError
