@@ -4,12 +4,12 @@
 //! `ValueError`.
 
 use crate::error;
+use crate::numbers::misfit;
 use numpy::ndarray::{ArrayD, IxDyn};
 use numpy::{
     Element, IntoPyArray, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
     PyUntypedArray, PyUntypedArrayMethods, dtype,
 };
-use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use rayon::prelude::*;
 
@@ -37,11 +37,10 @@ pub(crate) fn borrow<'py, T: Element>(
         let got = value.get_type().fully_qualified_name()?.to_string();
         let hint = if got.starts_with("torch.") { "; tensors: subsplat.torch" } else { "" };
         let expected = format!("a numpy array {shape} of {kind}");
-        return Err(PyTypeError::new_err(format!("{name}: expected {expected}, got {got}{hint}")));
+        return Err(misfit(name, expected, format!("{got}{hint}")));
     };
     if !array.dtype().is_equiv_to(&kind) {
-        let got = array.dtype();
-        return Err(PyTypeError::new_err(format!("{name}: expected {kind}, got {got}")));
+        return Err(misfit(name, kind, array.dtype()));
     }
     if !array.is_c_contiguous() {
         let got = format!("strides {:?}", array.strides());
@@ -52,7 +51,7 @@ pub(crate) fn borrow<'py, T: Element>(
         ));
     }
     let Ok(typed) = value.cast::<PyArrayDyn<T>>() else {
-        return Err(PyTypeError::new_err(format!("{name}: expected {kind}")));
+        return Err(misfit(name, kind, "another type"));
     };
     match typed.try_readonly() {
         Ok(array) => Ok(Array { name, array }),
@@ -117,6 +116,22 @@ pub(crate) fn finite(name: &str, values: &[f32], row: usize) -> Result<(), Strin
         Some(at) => {
             let (i, value) = (at / row.max(1), values[at]);
             Err(format!("{name}: expected finite numbers, got {value} in entry {i}"))
+        }
+    }
+}
+
+/// Refuses a quaternion of length 0, which is no rotation, and an opacity outside 0 to 1.
+pub(crate) fn check_gaussians(quats: &[f32], opacities: &[f32]) -> Result<(), String> {
+    let zero = |q: &[f32]| q.iter().map(|v| v * v).sum::<f32>() == 0.0;
+    if let Some(i) = quats.par_chunks_exact(4).with_min_len(PART / 4).position_first(zero) {
+        return Err(format!("quats: expected a length above 0, got 0 in entry {i}"));
+    }
+    let outside = |opacity: &f32| !(0.0..=1.0).contains(opacity);
+    match opacities.par_iter().with_min_len(PART).position_first(outside) {
+        None => Ok(()),
+        Some(i) => {
+            let got = opacities[i];
+            Err(format!("opacities: expected 0 to 1, after the sigmoid, got {got} in entry {i}"))
         }
     }
 }

@@ -2,6 +2,8 @@
 
 use crate::arrays::{Array, array, borrow};
 use crate::error;
+use crate::numbers::whole;
+use crate::raster::SIDES;
 use numpy::PyArrayDyn;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -19,9 +21,10 @@ impl Camera {
     fn new(
         viewmat: &Bound<'_, PyAny>,
         #[allow(non_snake_case, reason = "gsplat's name")] K: &Bound<'_, PyAny>,
-        width: usize,
-        height: usize,
+        width: &Bound<'_, PyAny>,
+        height: &Bound<'_, PyAny>,
     ) -> PyResult<Self> {
+        let (width, height) = (whole("width", width, SIDES)?, whole("height", height, SIDES)?);
         let viewmat = borrow::<f32>("viewmat", "[4, 4]", viewmat)?;
         viewmat.expect("[4, 4]", &[Some(4), Some(4)])?;
         let k = borrow::<f32>("K", "[3, 3]", K)?;
@@ -57,7 +60,8 @@ impl Camera {
     }
 
     /// The same camera for a picture of another size.
-    fn resized(&self, width: usize, height: usize) -> PyResult<Self> {
+    fn resized(&self, width: &Bound<'_, PyAny>, height: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let (width, height) = (whole("width", width, SIDES)?, whole("height", height, SIDES)?);
         let resized = self.0.resized(width, height);
         resized.map(Self).map_err(|e| PyValueError::new_err(e.to_string()))
     }

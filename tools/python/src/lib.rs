@@ -4,7 +4,7 @@
 //! module has what needs the library. Every function releases the interpreter's lock while it
 //! computes. An array that is passed is read in place: no function copies one.
 //!
-//! * `arrays.rs`: numpy arrays to slices, with one clear exception for each kind of misfit.
+//! * `arrays.rs`, `numbers.rs`: numpy arrays to slices and numbers, with one clear exception for each kind of misfit.
 //! * `raster.rs`, `camera_gradients.rs`: the rasterizer, forward and backward.
 //! * `camera.rs`, `scene.rs`, `photographs.rs`, `reconstruct.rs`: the classes and the calls on photographs.
 //! * `work.rs`: long calls, which hear Ctrl-C and report progress.
@@ -15,6 +15,7 @@ mod arrays;
 mod camera;
 mod camera_gradients;
 mod error;
+mod numbers;
 mod photographs;
 mod raster;
 mod reconstruct;

@@ -7,15 +7,19 @@ use crate::work::{self, Report};
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::PyString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use subsplat::files::photos::folder::find_photographs;
-use subsplat::files::poses::scene::{LoadedFrame, has_scene};
+use subsplat::files::poses::scene::{LoadedFrame, SceneFormat, has_scene};
 use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::scene::pictures::Rgb;
 use subsplat::{
-    DepthBounds, Error, EstimateOptions, EstimatedPhotos, LoadOptions, Photo, Photograph, Result,
-    estimate_cameras, load_photograph, load_scene,
+    DepthBounds, Error, EstimateOptions, EstimatedPhotos, EstimatedScene, LoadOptions, Photo,
+    Photograph, Result, Scene, estimate_cameras, estimate_cameras_of_files, load_photograph,
+    load_scene,
 };
+
+/// Stage of the estimation of cameras.
+const ESTIMATING: &str = "estimating the cameras";
 
 /// A photograph: a file or its pixels.
 pub(crate) enum Picture {
@@ -81,8 +85,8 @@ impl Source {
         }
     }
 
-    /// Reads the photographs, and estimates their cameras where they have none. At most `most`
-    /// photographs of a scene with cameras are read.
+    /// Reads the photographs, and estimates their cameras where they have none. Of a folder and of a scene
+    /// with cameras at most `most` photographs that overlap are read; of a list all.
     pub(crate) fn posed(
         self,
         cameras: Option<Vec<subsplat::Camera>>,
@@ -92,44 +96,50 @@ impl Source {
         if let Self::Path(path) = &self
             && has_scene(path)
         {
-            return of_scene(path, most, report);
+            return of_scene(load_scene(path)?, most, report);
         }
-        let photographs = self.photographs(report)?;
-        match cameras {
-            None => {
-                let (estimated, warnings) = estimate(photographs, report)?;
-                Ok(Posed { photos: estimated.photos, depth: None, warnings })
-            }
-            Some(cameras) => {
-                let mut warnings = Vec::new();
-                let photo = |(photograph, camera): (Photograph, subsplat::Camera)| {
-                    warnings.extend(photograph.warnings);
-                    let photo = Photo::new(photograph.image, camera)?;
-                    match photograph.mask {
-                        Some(mask) => photo.with_mask(mask),
-                        None => Ok(photo),
-                    }
-                };
-                let photos =
-                    photographs.into_iter().zip(cameras).map(photo).collect::<Result<_>>()?;
-                Ok(Posed { photos, depth: None, warnings })
-            }
+        if let Some(cameras) = cameras {
+            return with_cameras(self.photographs(report)?, cameras);
         }
+        if let Some((name, files)) = self.files()? {
+            let most = if matches!(self, Self::Path(_)) { most } else { files.len() };
+            return of_scene(estimate_of_files(&name, &files, report)?.scene, most, report);
+        }
+        let (estimated, warnings) = estimate(self.photographs(report)?, report)?;
+        Ok(Posed { photos: estimated.photos, depth: None, warnings })
     }
 
-    /// Decodes the photographs.
-    pub(crate) fn photographs(self, report: &mut Report<'_>) -> Result<Vec<Photograph>> {
+    /// The files of the photographs, and a name for all; `None` where pixels are among them.
+    ///
+    /// # Errors
+    /// A folder of fewer than two photographs.
+    pub(crate) fn files(&self) -> Result<Option<(PathBuf, Vec<PathBuf>)>> {
         let pictures = match self {
             Self::Pictures(pictures) => pictures,
             Self::Path(path) => {
-                let found = find_photographs(&path).photographs;
+                let found = find_photographs(path).photographs;
                 if found.len() < 2 {
                     let expected = "a folder of at least 2 photographs, or a scene with cameras";
                     let got = format!("{} photographs", found.len());
                     return Err(Error::argument(path.display().to_string(), expected, got));
                 }
-                found.into_iter().map(Picture::File).collect()
+                return Ok(Some((path.clone(), found)));
             }
+        };
+        let file = |picture: &Picture| match picture {
+            Picture::File(path) => Some(path.clone()),
+            Picture::Pixels(_) => None,
+        };
+        let files: Option<Vec<PathBuf>> = pictures.iter().map(file).collect();
+        Ok(files.map(|files| (PathBuf::from("photographs"), files)))
+    }
+
+    /// Decodes the photographs.
+    pub(crate) fn photographs(self, report: &mut Report<'_>) -> Result<Vec<Photograph>> {
+        let pictures = match (self.files()?, self) {
+            (Some((_, files)), _) => files.into_iter().map(Picture::File).collect(),
+            (None, Self::Pictures(pictures)) => pictures,
+            (None, Self::Path(_)) => Vec::new(),
         };
         let mut photographs = Vec::with_capacity(pictures.len());
         for picture in pictures {
@@ -148,14 +158,29 @@ fn step(report: &mut Report<'_>, stage: &str) -> Result<()> {
     if report(stage, 0.0).is_break() { Err(Error::Cancelled) } else { Ok(()) }
 }
 
-/// Estimates the cameras of photographs; with the warnings.
+/// Photographs with the cameras of the caller.
+fn with_cameras(photographs: Vec<Photograph>, cameras: Vec<subsplat::Camera>) -> Result<Posed> {
+    let mut warnings = Vec::new();
+    let photo = |(photograph, camera): (Photograph, subsplat::Camera)| {
+        warnings.extend(photograph.warnings);
+        let photo = Photo::new(photograph.image, camera)?;
+        match photograph.mask {
+            Some(mask) => photo.with_mask(mask),
+            None => Ok(photo),
+        }
+    };
+    let photos = photographs.into_iter().zip(cameras).map(photo).collect::<Result<_>>()?;
+    Ok(Posed { photos, depth: None, warnings })
+}
+
+/// Estimates the cameras of photographs in memory; with the warnings.
 pub(crate) fn estimate(
     photographs: Vec<Photograph>,
     report: &mut Report<'_>,
 ) -> Result<(EstimatedPhotos, Vec<String>)> {
     let mut warnings: Vec<String> =
         photographs.iter().flat_map(|photograph| photograph.warnings.clone()).collect();
-    step(report, "estimating the cameras")?;
+    step(report, ESTIMATING)?;
     let estimated = estimate_cameras(photographs, &EstimateOptions::default())?;
     let estimate = &estimated.estimate;
     warnings.extend(estimate.left_out_sentences(|photo| format!("photograph {photo}")));
@@ -163,14 +188,24 @@ pub(crate) fn estimate(
     Ok((estimated, warnings))
 }
 
-fn of_scene(path: &std::path::Path, most: usize, report: &mut Report<'_>) -> Result<Posed> {
-    let scene = load_scene(path)?;
-    let all: Vec<usize> = (0..scene.frames.len()).collect();
-    let chosen = if all.len() == 2 { Some(all) } else { choose_photographs(&scene, most) };
-    let Some(chosen) = chosen else {
+/// Estimates the cameras of photographs in files. The memory holds one photograph at a time.
+pub(crate) fn estimate_of_files(
+    name: &Path,
+    files: &[PathBuf],
+    report: &mut Report<'_>,
+) -> Result<EstimatedScene> {
+    let options = EstimateOptions::default();
+    estimate_cameras_of_files(name, files, &options, &mut |_| step(report, ESTIMATING))
+}
+
+/// Reads at most `most` photographs of a scene that overlap.
+fn of_scene(scene: Scene, most: usize, report: &mut Report<'_>) -> Result<Posed> {
+    let count = scene.frames.len();
+    let all = count == 2 || scene.source == SceneFormat::Photographs && count <= most;
+    let chosen = if all { Some((0..count).collect()) } else { choose_photographs(&scene, most) };
+    let Some(chosen): Option<Vec<usize>> = chosen else {
         let expected = "two photographs taken from different places";
-        let got = format!("{} from one place", scene.frames.len());
-        return Err(Error::argument(scene.name, expected, got));
+        return Err(Error::argument(scene.name, expected, format!("{count} from one place")));
     };
     let mut photos = Vec::with_capacity(chosen.len());
     for &i in &chosen {

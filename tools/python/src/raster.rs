@@ -3,20 +3,24 @@
 //! [`rasterize`] reads the arrays in place and returns three pictures, which its outputs own; a [`Frame`]
 //! keeps what the gradients need. Rasterizers with their buffers are reused from call to call.
 
-use crate::arrays::{Array, array, borrow, finite};
+use crate::arrays::{Array, array, borrow, check_gaussians, finite};
 use crate::camera::cameras;
 use crate::camera_gradients::viewmat_gradient;
 use crate::error;
+use crate::numbers::{optional_whole, real, whole};
 use numpy::PyArrayDyn;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::prelude::*;
+use std::ops::RangeInclusive;
 use std::sync::{Mutex, PoisonError};
 use subsplat::kernels::cpu::{Geometry, Gradients, Rasterizer, Rendered, SplatSlices};
 use subsplat::kernels::layout::{SH_DEGREE_MAX, ShDirection, sh_coefficients};
 use subsplat::{Camera, RasterOptions};
 
+/// Sides of a picture, px.
+pub(crate) const SIDES: RangeInclusive<usize> = 1..=32_768;
 /// Most pixels of all pictures of a call: 2 GB of outputs.
 const PIXELS_MAX: usize = 100_000_000;
 /// Idle rasterizers that are kept, about 200 bytes a Gaussian each.
@@ -99,10 +103,6 @@ impl<'py> Arrays<'py> {
             let colours = Colours { coefficients: 1, degree: 0, per_camera };
             return if fits { Ok(colours) } else { Err(self.colors.misfit(&expected)) };
         };
-        if wanted > SH_DEGREE_MAX {
-            let expected = format!("0 to {SH_DEGREE_MAX}");
-            return Err(error::value("sh_degree", expected, wanted));
-        }
         let degree = match shape {
             [count, d, 3] if *count == n => Some((*d, false)),
             [c, count, d, 3] if (*c, *count) == (cameras, n) => Some((*d, true)),
@@ -157,12 +157,14 @@ impl<'a> Slices<'a> {
         }
     }
 
-    fn check_finite(&self) -> Result<(), String> {
+    /// Refuses numbers of no Gaussian.
+    fn check_numbers(&self) -> Result<(), String> {
         finite("means", self.means, 3)?;
         finite("quats", self.quats, 4)?;
         finite("scales", self.scales, 3)?;
         finite("opacities", self.opacities, 1)?;
-        finite("colors", self.colors, 3 * self.colours.coefficients)
+        finite("colors", self.colors, 3 * self.colours.coefficients)?;
+        check_gaussians(self.quats, self.opacities)
     }
 
     /// Reports whether the lengths fit one another: an array may have been given another shape since.
@@ -246,16 +248,18 @@ pub(crate) fn rasterize<'py>(
     colors: &Bound<'py, PyAny>,
     viewmats: &Bound<'py, PyAny>,
     Ks: &Bound<'py, PyAny>,
-    width: usize,
-    height: usize,
-    near_plane: f32,
-    eps2d: f32,
-    sh_degree: Option<usize>,
+    width: &Bound<'py, PyAny>,
+    height: &Bound<'py, PyAny>,
+    near_plane: &Bound<'py, PyAny>,
+    eps2d: &Bound<'py, PyAny>,
+    sh_degree: Option<&Bound<'py, PyAny>>,
     antialiased: bool,
     backgrounds: Option<&Bound<'py, PyAny>>,
     keep: bool,
 ) -> PyResult<Rasterized<'py>> {
     let arrays = Arrays::borrow([means, quats, scales, opacities, colors])?;
+    let (width, height) = (whole("width", width, SIDES)?, whole("height", height, SIDES)?);
+    let sh_degree = optional_whole("sh_degree", sh_degree, 0..=SH_DEGREE_MAX)?;
     let viewmats = borrow("viewmats", "[C, 4, 4]", viewmats)?;
     let ks = borrow("Ks", "[C, 3, 3]", Ks)?;
     let cameras = cameras(&viewmats, &ks, (width, height))?;
@@ -268,7 +272,7 @@ pub(crate) fn rasterize<'py>(
     let colours = arrays.check(count, sh_degree)?;
     let backgrounds =
         backgrounds.map(|values| borrow("backgrounds", "[C, 3]", values)).transpose()?;
-    let kind = (near_plane, eps2d, antialiased);
+    let kind = (real("near_plane", near_plane)?, real("eps2d", eps2d)?, antialiased);
     let options = options(colours, sh_degree, kind, backgrounds.as_ref(), count)?;
     let slices = arrays.slices(colours)?;
     let drawn = py.detach(|| draw(&slices, &cameras, &options, keep));
@@ -302,7 +306,7 @@ fn draw(
     options: &[RasterOptions],
     keep: bool,
 ) -> Result<(Pictures, Vec<Rasterizer>), String> {
-    slices.check_finite()?;
+    slices.check_numbers()?;
     let (mut pictures, mut kept) = (Pictures::default(), Vec::new());
     let mut current = None;
     for (c, (camera, options)) in cameras.iter().zip(options).enumerate() {

@@ -3,7 +3,8 @@
 use crate::arrays::array;
 use crate::camera::Camera;
 use crate::error;
-use crate::photographs::{Posed, Source, estimate};
+use crate::numbers::{optional_whole, whole};
+use crate::photographs::{Posed, Source, estimate, estimate_of_files};
 use crate::scene::Scene;
 use crate::work;
 use numpy::PyArrayDyn;
@@ -11,11 +12,17 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use std::path::PathBuf;
 use subsplat::cameras::estimation::Confidence;
+use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::stages::check_pairs;
-use subsplat::{Density, Error, Options, Photo, Quality, Reconstructor, Refine};
+use subsplat::{
+    Backend, Density, Error, Options, Photo, Poses, Quality, Reconstructor, Refine, Renderer,
+};
 
 /// Most photographs of a scene with cameras, at `fast` and `normal`, and above: those of `subsplat run`.
 const PHOTOGRAPHS_MAX: [usize; 2] = [12, 6];
+
+/// Longest refinement, seconds.
+const SECONDS_MAX: usize = 1_000_000;
 
 /// Options of a reconstruction.
 struct Request {
@@ -27,16 +34,18 @@ struct Request {
 
 /// Reconstructs the scene of photographs.
 #[pyfunction]
-#[pyo3(signature = (photos, cameras, quality, gaussians, refine_seconds, upscale, weights, progress))]
+#[pyo3(signature = (photos, cameras, quality, gaussians, refine_seconds, upscale, adjust_poses, weights,
+    progress))]
 #[allow(clippy::too_many_arguments, reason = "the arguments of the Python function")]
 pub(crate) fn reconstruct(
     py: Python<'_>,
     photos: &Bound<'_, PyAny>,
     cameras: Option<Vec<PyRef<'_, Camera>>>,
     quality: &str,
-    gaussians: Option<usize>,
-    refine_seconds: Option<u32>,
-    upscale: usize,
+    gaussians: Option<&Bound<'_, PyAny>>,
+    refine_seconds: Option<&Bound<'_, PyAny>>,
+    upscale: &Bound<'_, PyAny>,
+    adjust_poses: bool,
     weights: Option<PathBuf>,
     progress: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<Scene> {
@@ -50,14 +59,18 @@ pub(crate) fn reconstruct(
         other => return Err(error::value("quality", "fast, normal, high or best", other)),
     };
     let mut options = Options::default().with_quality(level);
-    if let Some(count) = gaussians {
+    if adjust_poses {
+        options = options.with_poses(Poses::Adjusted);
+    }
+    if let Some(count) = optional_whole("gaussians", gaussians, 1..=usize::MAX)? {
         options = options.with_density(Density::Count(count));
     }
-    match refine_seconds {
+    match optional_whole("refine_seconds", refine_seconds, 0..=SECONDS_MAX)? {
         None => {}
         Some(0) => options = options.with_refine(Refine::Off),
-        Some(seconds) => options = options.with_refine(Refine::Seconds(seconds)),
+        Some(seconds) => options = options.with_refine(Refine::Seconds(seconds as u32)),
     }
+    let upscale = whole("upscale", upscale, 1..=UPSCALE_MAX)?;
     let request = Request { quality: level, upscale, weights, options };
     work::run(py, progress, move |report| run(source, cameras, request, report))
 }
@@ -79,7 +92,10 @@ fn run(
     let mut show = |p: subsplat::Progress| report(p.stage.description(), p.fraction);
     let prepared = model.prepare_with(&photos, &options, &mut show)?;
     drop(photos);
-    Ok(Scene::of(prepared.reconstruct_with(&mut show)?, warnings))
+    let result = prepared.reconstruct_with(&mut show)?;
+    let verdict =
+        result.assess(&mut Renderer::new(&Backend::Cpu), result.raster_options())?.verdict;
+    Ok(Scene::of(result, verdict, warnings))
 }
 
 /// Cameras, points `[M, 3]`, reliability and warnings.
@@ -93,11 +109,14 @@ pub(crate) fn estimate_cameras<'py>(
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Estimated<'py>> {
     let source = Source::new(photos)?;
-    let (estimated, warnings) = work::run(py, progress, move |report| {
-        let photographs = source.photographs(report)?;
-        estimate(photographs, report)
+    let (estimate, warnings) = work::run(py, progress, move |report| {
+        if let Some((name, files)) = source.files()? {
+            let found = estimate_of_files(&name, &files, report)?;
+            return Ok((found.estimate, found.scene.warnings));
+        }
+        let (found, warnings) = estimate(source.photographs(report)?, report)?;
+        Ok((found.estimate, warnings))
     })?;
-    let estimate = estimated.estimate;
     let points: Vec<f32> = estimate.points.iter().flat_map(|p| p.position.to_array()).collect();
     let count = estimate.points.len();
     let cameras = estimate.cameras.into_iter().map(|camera| camera.map(Camera)).collect();

@@ -1,8 +1,10 @@
 //! The class `Scene`: Gaussians with the rules to render them.
 
-use crate::arrays::{array, borrow, finite};
+use crate::arrays::{array, borrow, check_gaussians, finite};
 use crate::camera::Camera;
 use crate::error;
+use crate::numbers::{misfit, optional_whole, real, whole};
+use crate::raster::SIDES;
 use numpy::PyArrayDyn;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -12,15 +14,18 @@ use subsplat::files::{SplatFile, load_splat_file};
 use subsplat::kernels::layout::{
     OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SH_DEGREE_MAX, SPLAT_STRIDE, sh_coefficients,
 };
+use subsplat::reconstruct::{SceneVerdict, Trust};
 use subsplat::scene::render::{
     camera_of_comments, comment_of_camera, comment_of_options, options_of_comments, render,
 };
 use subsplat::{
-    Bounds, Convention, FileError, RasterOptions, Reconstruction, SaveOptions, ShBasis,
-    SplatFormat, Splats, Warning, encode_splats, parse_splats, save_splats,
+    Backend, Bounds, Convention, FileError, RasterOptions, Reconstruction, Renderer, SaveOptions,
+    ShBasis, SplatFormat, Splats, Warning, encode_splats, parse_splats, save_splats,
 };
 use subsplat_cli::commands::html::Page;
 
+/// Least size of a page: the viewer alone has a quarter of it.
+const PAGE_BYTES_MIN: usize = 200_000;
 /// Field of view of the camera that sees a whole scene, radians.
 const FOV: f32 = 1.0;
 
@@ -30,8 +35,12 @@ pub(crate) struct Scene {
     splats: Splats,
     options: RasterOptions,
     cameras: Vec<subsplat::Camera>,
+    verdict: Option<SceneVerdict>,
     warnings: Vec<String>,
 }
+
+/// Trust in a scene, the reason, and both as a sentence.
+type Verdict = (&'static str, String, String);
 
 /// Colours, alpha and depth of a picture.
 type Drawn<'py> =
@@ -74,6 +83,7 @@ impl Scene {
         ] {
             finite(name, values, row).map_err(PyValueError::new_err)?;
         }
+        check_gaussians(q, o).map_err(PyValueError::new_err)?;
         let mut rows = Vec::with_capacity(SPLAT_STRIDE * n);
         for (i, opacity) in o.iter().enumerate() {
             rows.extend_from_slice(&m[3 * i..3 * i + 3]);
@@ -84,7 +94,7 @@ impl Scene {
         let splats = Splats::new(rows, h.to_vec(), Vec::new(), degree, ShBasis::Standard);
         let splats = splats.map_err(|e| PyValueError::new_err(e.to_string()))?;
         let options = RasterOptions::default();
-        Ok(Self { splats, options, cameras: Vec::new(), warnings: Vec::new() })
+        Ok(Self { splats, options, cameras: Vec::new(), verdict: None, warnings: Vec::new() })
     }
 
     fn __len__(&self) -> usize {
@@ -97,6 +107,18 @@ impl Scene {
         self.cameras.iter().copied().map(Camera).collect()
     }
 
+    /// The verdict on a scene of photographs.
+    #[getter]
+    fn verdict(&self) -> Option<Verdict> {
+        let verdict = self.verdict.as_ref()?;
+        let trust = match verdict.trust {
+            Trust::Good => "good",
+            Trust::NearPhotographs => "near_photographs",
+            Trust::Wrong => "wrong",
+        };
+        Some((trust, verdict.reason.clone(), verdict.to_string()))
+    }
+
     /// Remarks about the photographs or the file.
     #[getter]
     fn warnings(&self) -> Vec<String> {
@@ -104,7 +126,8 @@ impl Scene {
     }
 
     /// A camera that sees the whole scene, along +z of the world.
-    fn overview(&self, side: usize) -> PyResult<Camera> {
+    fn overview(&self, side: &Bound<'_, PyAny>) -> PyResult<Camera> {
+        let side = whole("side", side, SIDES)?;
         let Some(bounds) = Bounds::of(self.splats.means()) else {
             return Err(PyValueError::new_err(
                 "overview: expected a scene with Gaussians, got none",
@@ -136,10 +159,19 @@ impl Scene {
     fn render<'py>(
         &self,
         py: Python<'py>,
-        camera: &Camera,
-        background: Option<[f32; 3]>,
+        camera: &Bound<'py, PyAny>,
+        background: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Drawn<'py>> {
-        let background = background.unwrap_or(self.options.background);
+        let Ok(camera) = camera.cast::<Camera>() else {
+            return Err(misfit("camera", "a subsplat.Camera", camera.repr()?));
+        };
+        let camera = camera.get();
+        let background = match background {
+            None => self.options.background,
+            Some(rgb) => rgb
+                .extract::<[f32; 3]>()
+                .or_else(|_| Err(misfit("background", "three numbers", rgb.repr()?)))?,
+        };
         finite("background", &background, 3).map_err(PyValueError::new_err)?;
         let options = RasterOptions { background, ..self.options };
         let k = camera.0.intrinsics();
@@ -152,26 +184,31 @@ impl Scene {
         ))
     }
 
-    /// Writes a file; its name decides the format.
+    /// Writes a file; its name decides the format. A page has at most `page_bytes` bytes.
     fn save(
         &self,
         py: Python<'_>,
         path: PathBuf,
-        sh_degree: Option<usize>,
-        min_opacity: f32,
+        sh_degree: Option<&Bound<'_, PyAny>>,
+        min_opacity: &Bound<'_, PyAny>,
         up: &str,
+        page_bytes: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<()> {
+        let sh_degree = optional_whole("sh_degree", sh_degree, 0..=SH_DEGREE_MAX)?;
+        let min_opacity = real("min_opacity", min_opacity)?;
+        let page_bytes = optional_whole("page_bytes", page_bytes, PAGE_BYTES_MIN..=usize::MAX)?;
         let up = up.parse().map_err(PyValueError::new_err)?;
         if !(0.0..=1.0).contains(&min_opacity) {
             return Err(error::value("min_opacity", "0 to 1", min_opacity));
         }
         let camera = self.cameras.first().map(comment_of_camera);
         let comments = std::iter::once(comment_of_options(&self.options)).chain(camera).collect();
-        let options = SaveOptions { sh_degree, min_opacity, up, comments };
+        let options =
+            SaveOptions { sh_degree, min_opacity, up, comments, ..SaveOptions::default() };
         let html = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("html"));
         py.detach(|| {
             if html {
-                self.save_page(&path, &options)
+                self.save_page(&path, &options, page_bytes)
             } else {
                 save_splats(&path, &self.splats, &options).map(drop).map_err(|e| error::of_file(&e))
             }
@@ -181,11 +218,16 @@ impl Scene {
 
 impl Scene {
     /// The scene of a reconstruction, with more `warnings`.
-    pub(crate) fn of(result: Reconstruction, mut warnings: Vec<String>) -> Self {
+    pub(crate) fn of(
+        result: Reconstruction,
+        verdict: SceneVerdict,
+        mut warnings: Vec<String>,
+    ) -> Self {
         warnings.extend(Warning::sentences(result.warnings()));
         let cameras = result.inputs().iter().map(|input| input.target_camera).collect();
         let options = *result.raster_options();
-        Self { splats: result.into_splats(), options, cameras, warnings }
+        let splats = result.into_splats();
+        Self { splats, options, cameras, verdict: Some(verdict), warnings }
     }
 
     /// The Gaussians with SH sets of their own in the standard basis, as a .ply file has them.
@@ -199,18 +241,22 @@ impl Scene {
         parse_splats(&file, "scene.ply").map(|(splats, _)| splats).map_err(|e| e.to_string())
     }
 
-    fn save_page(&self, path: &Path, options: &SaveOptions) -> PyResult<()> {
+    fn save_page(&self, path: &Path, options: &SaveOptions, most: Option<usize>) -> PyResult<()> {
         let title = path.file_stem().unwrap_or_default().to_string_lossy();
         let (splats, cameras) = (&self.splats, &self.cameras);
         let page = Page { splats, cameras, options: &self.options, title: &title };
-        page.write(path, options).map(drop).map_err(|e| match e.downcast_ref::<FileError>() {
+        let written = match most {
+            Some(most) => page.write_within(path, options, most, &mut Renderer::new(&Backend::Cpu)),
+            None => page.write(path, options),
+        };
+        written.map(drop).map_err(|e| match e.downcast_ref::<FileError>() {
             Some(e) => error::of_file(e),
             None => PyRuntimeError::new_err(e.to_string()),
         })
     }
 }
 
-/// Reads a .ply, .glb, .spz, .splat or .ksplat file.
+/// Reads a .ply, .glb, .spz, .sog, .splat or .ksplat file.
 #[pyfunction]
 pub(crate) fn load(py: Python<'_>, path: PathBuf) -> PyResult<Scene> {
     let read = py.detach(|| load_splat_file(&path));
@@ -218,5 +264,5 @@ pub(crate) fn load(py: Python<'_>, path: PathBuf) -> PyResult<Scene> {
     let options =
         options_of_comments(&comments).unwrap_or_else(|| RasterOptions::new(Convention::Standard));
     let cameras = camera_of_comments(&comments).into_iter().collect();
-    Ok(Scene { splats, options, cameras, warnings: notes })
+    Ok(Scene { splats, options, cameras, verdict: None, warnings: notes })
 }

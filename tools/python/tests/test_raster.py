@@ -1,5 +1,7 @@
 """The rasterizer: pictures and gradients against a reference, the fixtures and finite differences."""
 
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -159,9 +161,7 @@ def test_conformance_cases(name):
 
 
 def test_inputs_are_read_in_place(scene):
-    """The call holds the arrays that were passed, and no memory of their size beside its outputs."""
-    import sys
-
+    """The call holds the arrays that were passed."""
     n = 20_000
     large = make_scene(n=n, degree=4)
     large["width"] = large["height"] = 16
@@ -180,6 +180,37 @@ def test_inputs_are_read_in_place(scene):
     assert np.abs(first).max() > 0 and not np.array_equal(first, second)
     del frame
     assert [sys.getrefcount(a) for a in arrays[:5]] == before
+
+
+COUNT_MEMORY = """
+import resource
+import numpy as np
+import subsplat
+
+def most():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+n = 400_000
+arrays = [np.ones((n, k), np.float32) for k in (3, 4, 3)] + [np.ones(n, np.float32)]
+sh = np.ones((n, 25, 3), np.float32)
+# Every Gaussian lies behind the camera: the call needs little memory of its own.
+arrays[0] *= -1
+K = np.float32([[[20, 0, 8], [0, 20, 8], [0, 0, 1]]])
+call = lambda part: subsplat.rasterize(
+    *(a[:part] for a in arrays), sh[:part], np.eye(4, dtype=np.float32)[None], K, 16, 16, sh_degree=4
+)
+call(1000)
+before = most()
+call(n)
+print(most() - before, sum(a.nbytes for a in arrays) + sh.nbytes)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss has another unit")
+def test_a_call_takes_no_memory_of_the_size_of_its_arrays():
+    out = subprocess.run([sys.executable, "-c", COUNT_MEMORY], check=True, capture_output=True, text=True)
+    grown, size = map(int, out.stdout.split())
+    assert size > 130e6 and grown < 0.5 * size, f"{grown} bytes for arrays of {size}"
 
 
 def test_outputs_own_their_memory(scene):
@@ -227,7 +258,8 @@ REFUSED = [
     (lambda s: {"opacities": s["opacities"][:, None]}, ValueError, r"opacities: expected shape \[40\]"),
     (lambda s: {"colors": s["colors"][:, :1].copy()}, ValueError, r"colors: expected shape \[40, 3\]"),
     (lambda s: {"sh_degree": 1}, ValueError, r"colors: expected shape \[40, D, 3\]"),
-    (lambda s: {"sh_degree": 7}, ValueError, "sh_degree: expected 0 to 4, got 7"),
+    (lambda s: {"sh_degree": 7}, ValueError, "sh_degree: expected a whole number from 0 to 4, got 7"),
+    (lambda s: {"sh_degree": -1}, ValueError, "sh_degree: expected a whole number from 0 to 4, got -1"),
     (lambda s: {"means": s["means"].astype(np.float64)}, TypeError, "means: expected float32, got float64"),
     (lambda s: {"colors": (s["colors"] * 255).astype(np.uint8)}, TypeError, "colors: expected float32, got uint8"),
     (lambda s: {"means": s["means"].tolist()}, TypeError, r"means: expected a numpy array \[N, 3\] of float32"),
@@ -242,7 +274,12 @@ REFUSED = [
     (lambda s: {"viewmats": s["viewmats"][:0]}, ValueError, "at least one camera"),
     (lambda s: {"Ks": s["Ks"] * np.float32([[-1], [1], [1]])}, ValueError, "camera 0: .*"),
     (lambda s: {"Ks": np.repeat(s["Ks"], 2, 0)}, ValueError, r"Ks: expected shape \[1, 3, 3\]"),
-    (lambda s: {"width": 0}, ValueError, "camera 0: .*size"),
+    (lambda s: {"quats": 0 * s["quats"]}, ValueError, "quats: expected a length above 0, got 0 in entry 0"),
+    (lambda s: {"opacities": s["opacities"] + 1}, ValueError, "opacities: expected 0 to 1, after the sigmoid, got"),
+    (lambda s: {"width": 0}, ValueError, "width: expected a whole number from 1 to 32768, got 0"),
+    (lambda s: {"width": 3.5}, TypeError, "width: expected a whole number from 1 to 32768, got 3.5"),
+    (lambda s: {"height": 2**70}, ValueError, "height: expected a whole number from 1 to 32768"),
+    (lambda s: {"eps2d": "x"}, TypeError, "eps2d: expected a number, got 'x'"),
     (lambda s: {"width": 32768, "height": 32768}, ValueError, "pictures: expected at most"),
     (lambda s: {"near_plane": 0.0}, ValueError, "near_plane: expected a number above 0"),
     (lambda s: {"eps2d": float("nan")}, ValueError, "eps2d: expected"),

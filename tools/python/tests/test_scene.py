@@ -36,6 +36,7 @@ def test_a_scene_renders_what_rasterize_does():
     assert np.array_equal(picture.alpha, got.alphas[0, ..., 0])
     assert np.allclose(picture.depth, got.depths[0, ..., 0], rtol=1e-6)
     assert picture.to_uint8().dtype == np.uint8 and len(scene) == 50
+    assert scene.verdict is None
 
 
 def test_cameras_give_their_matrices_back():
@@ -90,8 +91,27 @@ def test_bad_files_are_one_exception(tmp_path):
         scene.save(tmp_path / "a.ply", up="x")
     with pytest.raises(ValueError, match="min_opacity"):
         scene.save(tmp_path / "a.ply", min_opacity=float("nan"))
+    with pytest.raises(ValueError, match="page_bytes: expected a whole number of at least 200000, got 10"):
+        scene.save(tmp_path / "a.html", page_bytes=10)
+    with pytest.raises(ValueError, match="sh_degree: expected a whole number from 0 to 4, got 9"):
+        scene.save(tmp_path / "a.ply", sh_degree=9)
+
+
+def test_bad_views_are_one_exception():
+    scene, arrays = small_scene()
     with pytest.raises(ValueError, match="background: expected finite"):
         scene.render(background=(0, float("nan"), 0))
+    for background in (1, (1, 2), "red"):
+        with pytest.raises(TypeError, match="background: expected three numbers"):
+            scene.render(background=background)
+    with pytest.raises(TypeError, match="camera: expected a subsplat.Camera, got 3"):
+        scene.render(3)
+    with pytest.raises(ValueError, match="side: expected a whole number from 1 to 32768, got -1"):
+        scene.overview(-1)
+    with pytest.raises(TypeError, match="width: expected a whole number from 1 to 32768, got 3.5"):
+        subsplat.Camera(arrays["viewmats"][0], arrays["Ks"][0], 3.5, 4)
+    with pytest.raises(TypeError, match="viewmat: expected float32, got float64"):
+        subsplat.Camera(np.eye(4), arrays["Ks"][0], 4, 4)
 
 
 def test_photographs_become_a_scene(tmp_path):
@@ -101,16 +121,21 @@ def test_photographs_become_a_scene(tmp_path):
     first = pil.open(paths[0])
     photos = [first, np.array(pil.open(paths[1]))]
     scene = subsplat.reconstruct(
-        photos, quality="fast", gaussians=20_000, progress=lambda *report: stages.append(report)
+        photos, quality="fast", gaussians=80_000, progress=lambda *report: stages.append(report)
     )
-    assert 5_000 < len(scene) <= 20_000 and len(scene.cameras) == 2
+    assert 60_000 < len(scene) <= 80_000 and len(scene.cameras) == 2
     picture = scene.render()
     assert picture.alpha.mean() > 0.8 and 0.1 < picture.rgb.mean() < 0.9
     names = [stage for stage, _ in stages]
     assert "estimating the cameras" in names and len(set(names)) > 4
     assert all(0 <= fraction <= 1 for _, fraction in stages)
+    assert scene.verdict.trust in ("good", "near_photographs")
+    assert str(scene.verdict).endswith(scene.verdict.reason)
     scene.save(tmp_path / "berlin.html")
-    assert (tmp_path / "berlin.html").stat().st_size > 100_000
+    whole = (tmp_path / "berlin.html").stat().st_size
+    assert whole > 1_000_000
+    scene.save(tmp_path / "berlin.html", page_bytes=500_000)
+    assert 250_000 < (tmp_path / "berlin.html").stat().st_size <= 500_000
     splats = scene.splats
     again = subsplat.rasterize(
         *splats[:4], splats.sh, scene.cameras[0].viewmat[None], scene.cameras[0].K[None],
@@ -152,6 +177,17 @@ def test_bad_photographs_are_one_exception(tmp_path):
             subsplat.reconstruct(photos)
     with pytest.raises(ValueError, match="quality: expected fast, normal, high or best, got 'x'|got x"):
         subsplat.reconstruct([good, good], quality="x")
+    for name, value in [("upscale", 9), ("gaussians", 0), ("gaussians", -5), ("refine_seconds", -1)]:
+        with pytest.raises(ValueError, match=f"{name}: expected a whole number .* got {value}"):
+            subsplat.reconstruct([good, good], **{name: value})
+    with pytest.raises(TypeError, match="gaussians: expected a whole number of at least 1, got 0.5"):
+        subsplat.reconstruct([good, good], gaussians=0.5)
+    with pytest.raises(FileNotFoundError, match="absent.safetensors"):
+        subsplat.reconstruct([good, good], weights="absent.safetensors")
+    with pytest.raises(TypeError, match="cameras: expected subsplat.Camera, got 1"):
+        subsplat.reconstruct([good, good], cameras=[1, 2])
+    with pytest.raises(TypeError, match="photos: expected a path or a list of photographs, got 5"):
+        subsplat.reconstruct(5)
     with pytest.raises(ValueError, match="cameras: expected 2 cameras"):
         subsplat.reconstruct([good, good], cameras=[])
     with pytest.raises(TypeError, match="progress: expected a function or True"):

@@ -103,6 +103,43 @@ def test_colours_go_uphill():
     assert losses[-1] < 0.02 * losses[0]
 
 
+def test_copies_are_counted(monkeypatch):
+    """Memory of tensors and of the arrays of the native calls: the same, in both directions and both passes."""
+    native, seen = subsplat._native.rasterize, []
+
+    class Frame:
+        def __init__(self, frame):
+            self.frame = frame
+
+        def backward(self, *upstream):
+            seen.append([None if v is None else v.ctypes.data for v in upstream[:3]])
+            found = self.frame.backward(*upstream)
+            seen.append({name: v.ctypes.data for name, v in found.items()})
+            return found
+
+    def counted(*arguments):
+        seen.append([a.ctypes.data for a in arguments[:7]])
+        *pictures, frame = native(*arguments)
+        seen.append([p.ctypes.data for p in pictures])
+        return (*pictures, Frame(frame))
+
+    monkeypatch.setattr(subsplat.torch._native, "rasterize", counted)
+    inputs, rest = tensors(make_scene())
+    pictures, alphas, _ = rasterization(**inputs, **rest)
+    v = torch.randn(pictures.shape)
+    pictures.backward(v)
+    given, drawn, upstream, found = seen
+    copies = [name for name, at in zip(NAMES, given) if at != inputs[name].data_ptr()]
+    copies += [name for name in NAMES[:5] if found[name] != inputs[name].grad.data_ptr()]
+    assert copies == []
+    assert drawn[:2] == [pictures.data_ptr(), alphas.data_ptr()] and upstream[0] == v.data_ptr()
+    # The counter counts: a tensor with strides is copied.
+    seen.clear()
+    inputs["means"] = torch.cat([inputs["means"].detach()] * 2, 1)[:, :3]
+    rasterization(**inputs, **rest)
+    assert sum(at != inputs[name].data_ptr() for name, at in zip(NAMES, seen[0])) == 1
+
+
 def test_a_tensor_with_strides_is_copied():
     inputs, rest = tensors(make_scene())
     wide = torch.cat([inputs["means"].detach()] * 2, 1).requires_grad_()

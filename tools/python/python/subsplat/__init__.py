@@ -12,6 +12,8 @@ place.
 ``subsplat.torch`` has the rasterizer for tensors. PyTorch is imported when it is first used.
 """
 
+from typing import Any
+
 from ._native import Camera, __version__
 from .photographs import (
     Estimate,
@@ -22,7 +24,7 @@ from .photographs import (
     reconstruct,
 )
 from .raster import Rasterized, rasterize, rasterize_backward
-from .scene import Picture, Scene, Splats, convert, load
+from .scene import Picture, Scene, Splats, Verdict, convert, load
 
 __all__ = [
     "Camera",
@@ -32,6 +34,7 @@ __all__ = [
     "Rasterized",
     "Scene",
     "Splats",
+    "Verdict",
     "check",
     "convert",
     "estimate_cameras",
@@ -44,7 +47,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> Any:
     if name == "torch":
         import importlib
 

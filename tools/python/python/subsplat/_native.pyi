@@ -1,6 +1,6 @@
 """The native module. Its functions have no defaults; the package's modules document and call them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any, Optional
 
@@ -46,11 +46,13 @@ class Scene:
     @property
     def cameras(self) -> list[Camera]: ...
     @property
+    def verdict(self) -> Optional[tuple[str, str, str]]: ...
+    @property
     def warnings(self) -> list[str]: ...
     def overview(self, side: int) -> Camera: ...
     def splats(self) -> dict[str, Floats]: ...
     def render(
-        self, camera: Camera, background: Optional[tuple[float, float, float]]
+        self, camera: Camera, background: Optional[Sequence[float]]
     ) -> tuple[Floats, Floats, Floats]: ...
     def save(
         self,
@@ -58,6 +60,7 @@ class Scene:
         sh_degree: Optional[int],
         min_opacity: float,
         up: str,
+        page_bytes: Optional[int],
     ) -> None: ...
 
 def rasterize(
@@ -88,6 +91,7 @@ def reconstruct(
     gaussians: Optional[int],
     refine_seconds: Optional[int],
     upscale: int,
+    adjust_poses: bool,
     weights: Optional[str | PathLike[str]],
     progress: Progress,
 ) -> Scene: ...

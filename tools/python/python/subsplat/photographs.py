@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable
 from typing import Any, Callable, NamedTuple, Optional, Sequence, Union
 
 import numpy as np
@@ -58,16 +59,19 @@ def reconstruct(
     gaussians: Optional[int] = None,
     refine_seconds: Optional[int] = None,
     upscale: int = 2,
+    adjust_poses: bool = False,
     weights: Optional[Path] = None,
     progress: Progress = None,
 ) -> Scene:
     """Makes a scene of two or more photographs of one place.
 
-    photos: a folder of photographs, or of a scene with cameras (COLMAP, transforms.json, cameras.json, …); or a
-    list of paths, PIL pictures and uint8 arrays [H, W, 3].
+    photos: a folder of photographs, or of a scene with cameras (COLMAP, transforms.json, cameras.json, …), of
+    which at most 12 photographs that overlap are used (6 at "high" and "best"); or a list of paths, PIL pictures
+    and uint8 arrays [H, W, 3], of which all are used.
     cameras: one for each photograph of a list. Without, the cameras are estimated.
-    quality: "fast", "normal", "high" or "best". gaussians: at most this number. refine_seconds: time of the
-    refinement, 0 for none. upscale: 1 to 8, Gaussians per input pixel and side. weights: a file of weights.
+    quality: "fast", "normal", "high" or "best". gaussians: at most this number after the refinement.
+    refine_seconds: time of the refinement, 0 for none. upscale: 1 to 8, Gaussians per input pixel and side.
+    adjust_poses: corrects cameras that are nearly right. weights: a file of weights.
     progress: a function of a stage (text) and the share that is done (0 to 1); True shows a bar (tqdm).
 
     Ctrl-C stops the call. Raises ValueError where the photographs do not determine their cameras, and OSError
@@ -76,7 +80,7 @@ def reconstruct(
     with _Bar(progress) as report:
         native = _native.reconstruct(
             _photos(photos), _cameras(cameras), quality, gaussians, refine_seconds, upscale,
-            None if weights is None else os.fspath(weights), report,
+            adjust_poses, None if weights is None else os.fspath(weights), report,
         )
     return Scene._of(native)
 
@@ -95,17 +99,20 @@ def check(
 ) -> list[dict[str, Any]]:
     """Checks whether cameras fit their photographs, by points that consecutive photographs share.
 
-    photos and cameras: as of `reconstruct`. Returns a dictionary for each pair: ``verdict`` ("ok", "warning" or
+    photos and cameras: as of `reconstruct` at "normal". Returns a dictionary for each pair: ``verdict`` ("ok", "warning" or
     "bad"), ``findings`` (each with ``severity``, ``code`` and ``sentence``), ``matches``, ``overlap``, … .
     """
     with _Bar(progress) as report:
-        return json.loads(_native.check(_photos(photos), _cameras(cameras), report))
+        reports = json.loads(_native.check(_photos(photos), _cameras(cameras), report))
+    return list(reports)
 
 
 def _photos(photos: Photos) -> Union[str, list[Any]]:
     """Paths as text, pictures as arrays."""
     if isinstance(photos, (str, os.PathLike)):
         return os.fspath(photos)
+    if not isinstance(photos, Iterable):
+        raise TypeError(f"photos: expected a path or a list of photographs, got {photos!r}")
     return [_photo(photo) for photo in photos]
 
 
@@ -120,7 +127,12 @@ def _photo(photo: Any) -> Any:
 
 
 def _cameras(cameras: Optional[Sequence[Camera]]) -> Optional[list[Camera]]:
-    return None if cameras is None else list(cameras)
+    if cameras is None:
+        return None
+    for camera in cameras:
+        if not isinstance(camera, Camera):
+            raise TypeError(f"cameras: expected subsplat.Camera, got {camera!r}")
+    return list(cameras)
 
 
 class _Bar:
@@ -130,13 +142,13 @@ class _Bar:
         if not (progress is None or isinstance(progress, bool) or callable(progress)):
             raise TypeError(f"progress: expected a function or True, got {progress!r}")
         self._progress = progress
-        self._bar = None
+        self._bar: Any = None
 
     def __enter__(self) -> Optional[Callable[[str, float], Any]]:
         if self._progress is not True:
             return self._progress or None
         try:
-            from tqdm.auto import tqdm
+            from tqdm.auto import tqdm  # type: ignore[import-untyped, unused-ignore]
         except ImportError as missing:
             raise ImportError("progress=True needs tqdm: pip install tqdm") from missing
         self._bar = tqdm(total=100, bar_format="{desc} {percentage:3.0f} %|{bar}| {elapsed}")

@@ -116,16 +116,17 @@ def rasterize_backward(
             raise ValueError(f"v_depths: expected shape {alphas.shape}, got {v_depths.shape}")
         v_sums, through_alpha = _expected_backward(v_depths, depth_sums, alphas)
         v_alphas = through_alpha if v_alphas is None else v_alphas + through_alpha
+    assert frame is not None, "keep is True"
     return frame.backward(v_colors, v_alphas, v_sums, True)
 
 
 def _expected(depth_sums: Floats, alphas: Floats) -> Floats:
     """Expected depth of Σ w·z and alpha."""
-    return depth_sums / np.maximum(alphas, np.float32(ALPHA_MIN))
+    return np.divide(depth_sums, np.maximum(alphas, np.float32(ALPHA_MIN)), dtype=np.float32)
 
 
 def _expected_backward(v: Floats, depth_sums: Floats, alphas: Floats) -> tuple[Floats, Floats]:
     """Gradients of `_expected` with respect to both arguments."""
     least = np.maximum(alphas, np.float32(ALPHA_MIN))
     through_alpha = np.where(alphas > ALPHA_MIN, -v * depth_sums / (least * least), 0)
-    return v / least, through_alpha.astype(np.float32)
+    return np.divide(v, least, dtype=np.float32), through_alpha.astype(np.float32)

@@ -16,6 +16,8 @@ from ._native import Camera
 Floats = NDArray[np.float32]
 Path = Union[str, "os.PathLike[str]"]
 
+# Largest page, bytes: that of `subsplat run`.
+PAGE_BYTES = 12_000_000
 # Height of the viewer in a notebook, px.
 VIEWER_HEIGHT = 480
 
@@ -50,6 +52,20 @@ class Splats(NamedTuple):
     """[N, D, 3]: SH coefficients; D = 1, 4, 9, 16 or 25."""
 
 
+class Verdict(NamedTuple):
+    """The verdict on a scene of photographs. Its text is one sentence."""
+
+    trust: str
+    """"good"; "near_photographs", where views near the photographs are right; or "wrong"."""
+    reason: str
+    """The likeliest cause, and what to do."""
+    sentence: str
+    """Both."""
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
 class Scene:
     """3D Gaussians with the rules to render them.
 
@@ -82,6 +98,12 @@ class Scene:
         return self._native.cameras
 
     @property
+    def verdict(self) -> Optional[Verdict]:
+        """How far a scene of photographs can be trusted; None for one of a file or of arrays."""
+        verdict = self._native.verdict
+        return None if verdict is None else Verdict(*verdict)
+
+    @property
     def warnings(self) -> list[str]:
         """Remarks about the photographs or the file, a sentence each."""
         return self._native.warnings
@@ -104,8 +126,6 @@ class Scene:
         """
         if camera is None:
             camera = next(iter(self.cameras), None) or self.overview()
-        if background is not None:
-            background = tuple(float(v) for v in background)
         return Picture(*self._native.render(camera, background))
 
     def save(
@@ -115,13 +135,16 @@ class Scene:
         sh_degree: Optional[int] = None,
         min_opacity: float = 0.0,
         up: str = "keep",
+        page_bytes: Optional[int] = PAGE_BYTES,
     ) -> None:
-        """Writes a .ply, .glb, .spz or .splat file, or a .html page with a viewer.
+        """Writes a .ply, .glb, .spz, .sog or .splat file, or a .html page with a viewer.
 
         sh_degree: highest degree of colours that is written; None is what the format's readers know.
         min_opacity: Gaussians of a lower opacity are left out. up: "keep" (OpenCV, y down), "y" or "z".
+        page_bytes: size of a page. Of a larger scene it has one colour for all views, then fewer Gaussians; with
+        None all.
         """
-        self._native.save(os.fspath(path), sh_degree, min_opacity, up)
+        self._native.save(os.fspath(path), sh_degree, min_opacity, up, page_bytes)
 
     def _repr_html_(self) -> str:
         with tempfile.TemporaryDirectory() as folder:
@@ -136,7 +159,7 @@ class Scene:
 
 
 def load(path: Path) -> Scene:
-    """Reads a .ply, .glb, .spz, .splat or .ksplat file."""
+    """Reads a .ply, .glb, .spz, .sog, .splat or .ksplat file."""
     return Scene._of(_native.load(os.fspath(path)))
 
 

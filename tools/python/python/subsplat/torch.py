@@ -89,13 +89,14 @@ def _array(tensor: Optional[torch.Tensor]) -> Any:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, *arguments):
+    def forward(ctx: Any, *arguments: Any) -> Any:
         *tensors, backgrounds, settings = arguments
         width, height, near_plane, eps2d, sh_degree, smooth = settings
         keep = any(ctx.needs_input_grad)
+        means, quats, scales, opacities, colors, viewmats, Ks = map(_array, tensors)
         rgb, alphas, depths, ctx.frame = _native.rasterize(
-            *map(_array, tensors), width, height, near_plane, eps2d, sh_degree, smooth,
-            _array(backgrounds), keep,
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane,
+            eps2d, sh_degree, smooth, _array(backgrounds), keep,
         )
         ctx.set_materialize_grads(False)
         # PyTorch refuses a backward pass after a change of these in place.
@@ -104,7 +105,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_rgb, v_alphas, v_depths):
+    def backward(ctx: Any, v_rgb: Any, v_alphas: Any, v_depths: Any) -> Any:
         ctx.saved_tensors  # noqa: B018 (the check above)
         needs = ctx.needs_input_grad
         found = ctx.frame.backward(_array(v_rgb), _array(v_alphas), _array(v_depths), needs[5])
