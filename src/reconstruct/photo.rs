@@ -7,6 +7,7 @@ use crate::files::poses::scene::{Frame, LoadedFrame};
 use crate::reconstruct::inputs::crop::{CropOptions, Cropped, crop_masked};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
+use std::path::Path;
 use std::sync::Arc;
 use subsplat_kernels::camera::{Camera, Size};
 
@@ -17,6 +18,8 @@ pub struct Photo {
     /// Pixels that count, of the picture's size.
     mask: Option<Arc<Mask>>,
     camera: Camera,
+    /// The picture of which this is a view, as those of a panorama are.
+    view_of: Option<Arc<Path>>,
 }
 
 impl Photo {
@@ -38,7 +41,7 @@ impl Photo {
             let got = format!("one of {}x{}", k.width, k.height);
             return Err(Error::argument("photograph", expected, got));
         }
-        Ok(Self { image: Arc::new(image), mask: None, camera })
+        Ok(Self { image: Arc::new(image), mask: None, camera, view_of: None })
     }
 
     /// The same photograph with a mask. Masked pixels make no Gaussians and have no weight in the optimisation, and
@@ -77,8 +80,9 @@ impl Photo {
 
     /// Takes over picture, mask and camera of a frame. Its warnings are the caller's matter.
     pub fn from_loaded(frame: LoadedFrame) -> Self {
-        let LoadedFrame { picture, mask, camera, .. } = frame;
-        Self { image: Arc::new(picture), mask: mask.map(Arc::new), camera }
+        let LoadedFrame { picture, mask, camera, view_of, .. } = frame;
+        let (mask, view_of) = (mask.map(Arc::new), view_of.map(Arc::from));
+        Self { image: Arc::new(picture), mask, camera, view_of }
     }
 
     /// The same pixels with the pose of another camera; the intrinsics stay.
@@ -92,7 +96,7 @@ impl Photo {
     /// The same pixels with another camera of their size.
     pub fn with_camera(&self, camera: Camera) -> Result<Self> {
         let camera = Camera::new(camera.intrinsics(), camera.world_from_camera())?;
-        Ok(Self { image: Arc::clone(&self.image), mask: self.mask.clone(), camera })
+        Ok(Self { camera, ..self.clone() })
     }
 
     /// The size.
@@ -108,6 +112,11 @@ impl Photo {
     /// Pixels that count; `None` where all do.
     pub fn mask(&self) -> Option<&Mask> {
         self.mask.as_deref()
+    }
+
+    /// The picture of which this is a view; `None` for a whole photograph.
+    pub(super) fn view_of(&self) -> Option<&Path> {
+        self.view_of.as_deref()
     }
 
     /// Pinhole camera of these pixels.

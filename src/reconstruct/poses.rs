@@ -36,6 +36,24 @@ pub(super) fn refuse_bad(reports: &[PairReport]) -> Result<()> {
     }
 }
 
+/// Findings about cameras. The others say that two photographs were badly chosen, which views of two panoramas in
+/// different directions were not.
+const OF_CAMERAS: [&str; 2] = ["poses_wrong", "poses_imprecise"];
+
+/// Checks a pair. Views of one picture have one centre, where no depth can be seen: their report is empty.
+fn check(a: &Photo, b: &Photo) -> Result<PairReport> {
+    if a.view_of().is_some() && a.view_of() == b.view_of() {
+        return Ok(PairReport::default());
+    }
+    let options = CheckOptions::default();
+    let mut report = check_pair(&grey(a)?, a.camera(), &grey(b)?, b.camera(), &options);
+    if a.view_of().is_some() || b.view_of().is_some() {
+        report.findings.retain(|finding| OF_CAMERAS.contains(&finding.code.as_str()));
+        report.verdict = report.findings.iter().map(|f| f.severity).max().unwrap_or_default();
+    }
+    Ok(report)
+}
+
 /// Matches each photograph with the next one. `checked` receives the share of pairs that are
 /// done. Grey images exist for one pair at a time.
 ///
@@ -48,9 +66,7 @@ pub fn check_pairs(
     let pairs = photos.len().saturating_sub(1);
     let mut reports = Vec::with_capacity(pairs);
     for pair in photos.windows(2) {
-        let [a, b] = [grey(&pair[0])?, grey(&pair[1])?];
-        let options = CheckOptions::default();
-        reports.push(check_pair(&a, pair[0].camera(), &b, pair[1].camera(), &options));
+        reports.push(check(&pair[0], &pair[1])?);
         checked(reports.len() as f32 / pairs as f32)?;
     }
     Ok(reports)
@@ -106,6 +122,36 @@ fn grey(photo: &Photo) -> Result<GrayImage> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::files::poses::scene::LoadedFrame;
+    use std::path::PathBuf;
+    use subsplat_kernels::camera::Intrinsics;
+
+    #[test]
+    fn views_of_one_picture_are_no_pair() {
+        let k = Intrinsics { fx: 200.0, fy: 200.0, cx: 120.0, cy: 90.0, width: 240, height: 180 };
+        let camera = Camera::new(k, glam::Mat4::IDENTITY).unwrap();
+        // Squares of 6 px, grey.
+        let mut picture = Rgb::black(240, 180);
+        for (i, pixel) in picture.data.chunks_exact_mut(3).enumerate() {
+            let square = (i / 240 / 6 * 40 + i % 240 / 6) as u32;
+            pixel.fill((square.wrapping_mul(2_654_435_761) >> 24) as u8);
+        }
+        let photo = |view_of: Option<&str>| {
+            let view_of = view_of.map(PathBuf::from);
+            let warnings = Vec::new();
+            let frame =
+                LoadedFrame { picture: picture.clone(), mask: None, camera, view_of, warnings };
+            Photo::from_loaded(frame)
+        };
+        let codes = |of: [Option<&str>; 2]| -> Vec<String> {
+            let reports = check_pairs(&of.map(photo), |_| Ok(())).unwrap();
+            reports[0].findings.iter().map(|finding| finding.code.clone()).collect()
+        };
+        // Two photographs from one place, and views of two pictures there.
+        assert!(codes([None, None]).contains(&"poses_wrong".to_owned()));
+        assert_eq!(codes([Some("a.jpg"), Some("b.jpg")]), ["poses_wrong"]);
+        assert!(codes([Some("a.jpg"), Some("a.jpg")]).is_empty());
+    }
 
     #[test]
     fn a_bad_pair_is_named_with_its_finding() {

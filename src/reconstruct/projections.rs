@@ -6,9 +6,9 @@ use super::Result;
 use super::estimate_cameras::{EstimateOptions, LensSource, lens};
 use crate::cameras::estimation::{Lens, PhotoView, PoseEstimate, PosePhoto, PosePoint};
 use crate::files::Error as FileError;
+use crate::files::photos::distortion::Distortion;
 use crate::files::photos::photograph::{Photograph, load_photograph_or_panorama, panorama_shape};
 use crate::files::photos::shape::{ImageCircle, edges_meet, image_circle};
-use crate::files::photos::undistort::Distortion;
 use crate::files::photos::views::{
     Cut, YAWS, fisheye_cut, has_panorama_shape, own_axes, panorama_cut, panorama_view, shared_axes,
     view_label,

@@ -8,8 +8,8 @@ use glam::{DMat3, DVec3};
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::files::Error;
+use subsplat::files::photos::distortion::Distortion;
 use subsplat::files::photos::image::save_png;
-use subsplat::files::photos::undistort::Distortion;
 use subsplat::files::poses::bundler;
 use subsplat::files::poses::cameras_json::NamedCamera;
 use subsplat::files::poses::find::not_read;
@@ -22,7 +22,7 @@ use subsplat::image::{ExtendedColorType, ImageEncoder};
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// A folder and cameras as [`made_up`] has them, with one focal length and the principal point in the middle.
-fn plain(n: usize) -> (tempfile::TempDir, Vec<NamedCamera>) {
+pub(crate) fn plain(n: usize) -> (tempfile::TempDir, Vec<NamedCamera>) {
     let (folder, mut cameras) = made_up(n);
     for c in &mut cameras {
         let k = c.camera.intrinsics();
@@ -33,24 +33,24 @@ fn plain(n: usize) -> (tempfile::TempDir, Vec<NamedCamera>) {
 }
 
 /// Columns of the camera's axes in the world (right, down, forward), and its position.
-fn axes(camera: &Camera) -> [DVec3; 4] {
+pub(crate) fn axes(camera: &Camera) -> [DVec3; 4] {
     let m = camera.world_from_camera().as_dmat4();
     [m.x_axis, m.y_axis, m.z_axis, m.w_axis].map(|v| v.truncate())
 }
 
 /// Rows of the 3×4 matrix with these columns.
-fn rows([a, b, c, t]: [DVec3; 4]) -> [[f64; 4]; 3] {
+pub(crate) fn rows([a, b, c, t]: [DVec3; 4]) -> [[f64; 4]; 3] {
     [0, 1, 2].map(|i| [a[i], b[i], c[i], t[i]])
 }
 
 /// Rows of camera-to-world with the axes right, up, backward.
-fn opengl_rows(camera: &Camera) -> [[f64; 4]; 3] {
+pub(crate) fn opengl_rows(camera: &Camera) -> [[f64; 4]; 3] {
     let [right, down, forward, t] = axes(camera);
     rows([right, -down, -forward, t])
 }
 
 #[track_caller]
-fn check(scene: &Scene, source: SceneFormat, cameras: &[NamedCamera]) {
+pub(crate) fn check(scene: &Scene, source: SceneFormat, cameras: &[NamedCamera]) {
     assert_eq!(scene.source, source);
     assert_eq!(scene.frames.len(), cameras.len(), "{:?}", scene.warnings);
     for (frame, camera) in scene.frames.iter().zip(cameras) {
@@ -66,7 +66,7 @@ fn check(scene: &Scene, source: SceneFormat, cameras: &[NamedCamera]) {
 }
 
 #[track_caller]
-fn refused<T>(case: &str, result: Result<T, Error>, words: &[&str]) {
+pub(crate) fn refused<T>(case: &str, result: Result<T, Error>, words: &[&str]) {
     let error = match result {
         Ok(_) => panic!("{case}: was accepted"),
         Err(error) => error.to_string(),
@@ -74,7 +74,7 @@ fn refused<T>(case: &str, result: Result<T, Error>, words: &[&str]) {
     words.iter().for_each(|word| assert!(error.contains(word), "{case}: {error}"));
 }
 
-fn write(path: &Path, bytes: impl AsRef<[u8]>) {
+pub(crate) fn write(path: &Path, bytes: impl AsRef<[u8]>) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     std::fs::write(path, bytes).unwrap();
 }
@@ -508,6 +508,9 @@ fn exports_of_nerfstudio_are_read() {
         c.camera = Camera::new(k, c.camera.world_from_camera()).unwrap();
     }
     check(&load_scene(folder.path()).unwrap(), SceneFormat::Nerfstudio, &cameras);
+    // The second file of the export alone.
+    std::fs::rename(&path, folder.path().join("transforms_eval.json")).unwrap();
+    check(&load_scene(folder.path()).unwrap(), SceneFormat::Nerfstudio, &cameras);
     // A path of the viewer: the angle of view is that from top to bottom.
     let fov = 2.0 * (24.0 / focal).atan().to_degrees();
     let through: Vec<Value> = cameras
@@ -522,6 +525,10 @@ fn exports_of_nerfstudio_are_read() {
     let path = folder.path().join("camera_path.json");
     write(&path, file.to_string());
     check(&load_cameras(&path).unwrap(), SceneFormat::Nerfstudio, &cameras);
+    file["camera_type"] = json!("equirectangular");
+    write(&path, file.to_string());
+    refused("a panorama", load_cameras(&path), &["camera_type perspective", "`equirectangular`"]);
+    file["camera_type"] = json!("perspective");
     file["camera_path"][0]["fov"] = json!(180);
     file["camera_path"][1]["camera_to_world"] = json!([1, 2, 3]);
     write(&path, file.to_string());

@@ -13,3 +13,4 @@ mod photographs;
 mod resize;
 mod scene_formats;
 mod scenes;
+mod surveys;

@@ -7,7 +7,8 @@ use subsplat_test_support::noise::noise;
 use std::path::Path;
 use subsplat::files::photos::image::save_png;
 use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::files::poses::scene::{Scene, load_cameras_with, load_scene};
+use subsplat::files::poses::colmap::parse_cameras_txt;
+use subsplat::files::poses::scene::{Scene, SceneFormat, load_cameras_with, load_scene};
 use subsplat::{SceneOptions, load_scene_with};
 
 fn write_model(folder: &Path, cameras: &[NamedCamera]) {
@@ -173,6 +174,48 @@ fn pose_files_in_utf_16_are_read() {
                 \"fy\": 70, \"rotation\": [[1,0,0],[0,1,0],[0,0,1]], \"position\": [0,0,0]}]";
     std::fs::write(&path, list).unwrap();
     assert_eq!(names(&load_scene(folder.path()).unwrap()), ["000"]);
+}
+
+/// The same of text files.
+#[test]
+fn text_files_in_utf_16_are_read() {
+    let (folder, cameras) = made_up(3);
+    let at = |name: &str| folder.path().join(name);
+    write_model(&at("sparse/0"), &cameras);
+    let rewrite = |files: &[&str]| {
+        for file in files {
+            let text = std::fs::read_to_string(at(file)).unwrap();
+            let units: Vec<u16> = std::iter::once(0xfeff).chain(text.encode_utf16()).collect();
+            let bytes: Vec<u8> = units.into_iter().flat_map(u16::to_be_bytes).collect();
+            std::fs::write(at(file), bytes).unwrap();
+        }
+    };
+    let model = ["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"];
+    let plain = load_scene(folder.path()).unwrap();
+    rewrite(&model);
+    assert_eq!(load_scene(folder.path()).unwrap(), plain);
+    // UTF-8's mark, and bytes that are neither.
+    let text = "\u{feff}# Cameras\n1 PINHOLE 64 48 70 70 32 24\n";
+    assert_eq!(parse_cameras_txt("cameras.txt", text.as_bytes()).unwrap().len(), 1);
+    let error = parse_cameras_txt("cameras.txt", b"1 PINHOLE\n\xff\n").unwrap_err().to_string();
+    assert!(error.contains("cameras.txt:2") && error.contains("UTF-8"), "{error}");
+    std::fs::remove_dir_all(at("sparse")).unwrap();
+    // Plain matrices.
+    let poses: Vec<String> = (0..3).map(|i| format!("1 0 0 {i} 0 1 0 0 0 0 1 0")).collect();
+    std::fs::write(at("poses.txt"), poses.join("\r\n")).unwrap();
+    std::fs::write(at("K.txt"), "70 70 32 24").unwrap();
+    let plain = load_scene(folder.path()).unwrap();
+    rewrite(&["poses.txt", "K.txt"]);
+    assert_eq!(load_scene(folder.path()).unwrap(), plain);
+    std::fs::remove_file(at("poses.txt")).unwrap();
+    // RealEstate10K.
+    let line = |i: usize| format!("{i} 0.9 1.2 0.5 0.5 0 0 1 0 0 {i} 0 1 0 0 0 0 1 0");
+    let text = format!("https://example.org/a\n{}\n{}\n{}\n", line(0), line(1), line(2));
+    std::fs::write(at("a.txt"), text).unwrap();
+    let plain = load_scene(folder.path()).unwrap();
+    assert_eq!((plain.source, plain.frames.len()), (SceneFormat::RealEstate10k, 3));
+    rewrite(&["a.txt"]);
+    assert_eq!(load_scene(folder.path()).unwrap(), plain);
 }
 
 /// Masks of cameras.json are written and read back.

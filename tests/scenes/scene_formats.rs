@@ -8,8 +8,8 @@ use glam::{Mat4, Vec3};
 use made_up::made_up;
 use noise::noise;
 use std::path::PathBuf;
+use subsplat::files::photos::distortion::Distortion;
 use subsplat::files::photos::image;
-use subsplat::files::photos::undistort::Distortion;
 use subsplat::files::poses::cameras_json::{
     CameraFile, NamedCamera, load_cameras_json, save_cameras_json,
 };

@@ -10,8 +10,9 @@
 //! only, because Gaussians follow wrong poses faster. Measurements: `src/network/shipped/README.md`, "The refinement".
 
 use super::absolute::Absolute;
+use super::edges::{Edge, edges};
 use super::photo::PosePhoto;
-use super::reconstruct::{self, Edge};
+use super::reconstruct;
 use super::two_view::rotation_angle;
 use glam::{DMat3, DQuat, DVec3, Mat4};
 use subsplat_kernels::camera::Camera;
@@ -50,7 +51,7 @@ pub fn adjust_poses(photos: &[PosePhoto], cameras: &[Camera], seed: u64) -> Opti
         return None;
     }
     let given: Vec<Absolute> = cameras.iter().map(absolute).collect();
-    let mut edges = reconstruct::edges(photos, seed);
+    let mut edges = edges(photos, seed);
     edges.retain(|e| agrees(e, &given));
     let adjusted = reconstruct::adjust(photos, &edges, &given)?;
     let few = adjusted.points < CERTAIN_POINTS * photos.len();

@@ -1,10 +1,11 @@
 //! The estimate for applications: from photographs to cameras, points and a confidence.
 
 use super::absolute::Absolute;
+use super::edges::{self, Edge};
 use super::groups;
 use super::pair::{self, PairEstimate};
 use super::photo::PosePhoto;
-use super::reconstruct::{self, Edge, Model, Point, midpoint};
+use super::reconstruct::{self, Model, Point, midpoint};
 use super::refine::FocalPrior;
 use super::tracks::FeatureId;
 use super::two_view::Bearings;
@@ -477,10 +478,9 @@ fn median(mut values: Vec<f64>) -> f64 {
 /// Three and more photographs.
 fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, PoseRefusal> {
     let deviation = photos.iter().fold(0.0f64, |m, p| m.max(p.lens.deviation));
-    let first =
-        if deviation > STATED { reconstruct::focal_scale(photos, options.seed) } else { 1.0 };
+    let first = if deviation > STATED { edges::focal_scale(photos, options.seed) } else { 1.0 };
     let exact: Vec<PosePhoto> = photos.par_iter().map(|p| p.with_focal(first)).collect();
-    let edges = reconstruct::edges(&exact, options.seed);
+    let edges = edges::edges(&exact, options.seed);
     let accepted = options.uncertain == Uncertain::Accept;
     let sound = |e: &Edge| accepted || refusal(&exact[e.photos[0]], &e.estimate).is_none();
     let usable: Vec<Edge> = edges.into_iter().filter(sound).collect();

@@ -9,7 +9,7 @@
 //! Cameras that are nearly right are adjusted by [`adjust_poses`] (`adjust.rs`).
 //!
 //! Two photographs: points are matched, an essential matrix is estimated and refined
-//! (`pair.rs`). Three and more: pairs are joined one by one (`reconstruct.rs`) and adjusted
+//! (`pair.rs`). Three and more: pairs are verified (`edges.rs`), joined one by one (`reconstruct.rs`) and adjusted
 //! together (`bundle.rs`). Of photographs that fall into groups without common points the largest
 //! group is used (`groups.rs`). The world's +y axis points down as far as the cameras' horizon says
 //! (`world.rs`); its unit is the median depth of the points.
@@ -17,6 +17,7 @@
 mod absolute;
 mod adjust;
 mod bundle;
+mod edges;
 mod estimate;
 mod five_point;
 mod groups;

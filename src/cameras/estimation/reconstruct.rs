@@ -1,6 +1,6 @@
 //! Cameras and points of three or more photographs, one photograph after the other.
 //!
-//! Pairs are matched and verified ([`Edge`]); their matches join to tracks. The best pair of the
+//! Pairs are matched and verified (`edges.rs`); their matches join to tracks. The best pair of the
 //! largest group ([`Groups`]) starts; then the photograph that sees most points is located among
 //! them, its tracks give new points, and all cameras and points are adjusted together. Where a
 //! larger group is left out than was placed, it is reconstructed as well, and the model with most
@@ -11,18 +11,14 @@
 
 use super::absolute::{Absolute, Sight, in_view, locate};
 use super::bundle::{Bundle, Observation};
+use super::edges::{Edge, edges_of};
 use super::groups::Groups;
-use super::pair::{self, PairEstimate};
 use super::photo::{PosePhoto, aligned_position, deviations};
 use super::refine::FocalPrior;
 use super::tracks::{FeatureId, tracks};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Smallest number of matches of a verified pair.
-const MIN_PAIR_INLIERS: usize = 20;
-/// Smallest number of its matches that were found without a geometry.
-const MIN_PAIR_CONSISTENT: usize = 16;
 /// Smallest number of points by which a photograph is located.
 const MIN_SIGHTS: usize = 12;
 /// Smallest share of the points that agree with a located photograph.
@@ -36,23 +32,9 @@ const GIVEN_LIMIT: f64 = 100.0;
 const MIN_ANGLE: f64 = 0.026;
 /// Angle between rays at which a pair is wide enough to start with, radians (6 degrees).
 const START_ANGLE: f64 = 0.105;
-/// Photographs that are compared with all others; of more, each is compared with this many
-/// neighbours in their order and with the photographs most alike.
-const PARTNERS: usize = 10;
 /// Largest number of models that are built: the first one, and others of photographs that it leaves
 /// out. It bounds the time where one model after the other places few photographs.
 const MODELS: usize = 4;
-/// Features by which likeness is judged.
-const SKETCH: usize = 700;
-
-/// Two photographs with a verified relative pose.
-#[derive(Clone, Debug)]
-pub(super) struct Edge {
-    /// Indices of the photographs, the smaller first.
-    pub photos: [usize; 2],
-    /// Their relative pose.
-    pub estimate: PairEstimate,
-}
 
 /// A point with its features.
 #[derive(Clone, Debug)]
@@ -85,86 +67,6 @@ impl Model {
     fn placed(&self) -> usize {
         self.cameras.iter().flatten().count()
     }
-}
-
-/// Returns the pairs of photographs that are compared in full: all of a few photographs, else those
-/// that are most alike by their strongest features.
-fn compared(photos: &[PosePhoto]) -> Vec<[usize; 2]> {
-    let n = photos.len();
-    let all: Vec<[usize; 2]> = (0..n).flat_map(|i| (i + 1..n).map(move |j| [i, j])).collect();
-    if n <= PARTNERS {
-        return all;
-    }
-    let sketches: Vec<_> = photos.par_iter().map(|p| p.features.strongest(SKETCH)).collect();
-    let alike: Vec<usize> = all
-        .par_iter()
-        .map(|&[i, j]| crate::cameras::matches::pairs::pairs(&sketches[i], &sketches[j]).len())
-        .collect();
-    let mut chosen = vec![false; all.len()];
-    for photo in 0..n {
-        let mut own: Vec<usize> = (0..all.len()).filter(|&k| all[k].contains(&photo)).collect();
-        own.sort_by_key(|&k| std::cmp::Reverse(alike[k]));
-        own.iter().take(PARTNERS).for_each(|&k| chosen[k] = true);
-    }
-    all.into_iter().zip(chosen).filter_map(|(pair, c)| c.then_some(pair)).collect()
-}
-
-/// Estimates the relative poses of all comparable pairs.
-pub(super) fn edges(photos: &[PosePhoto], seed: u64) -> Vec<Edge> {
-    edges_of(photos, compared(photos), seed)
-}
-
-/// Estimates the relative poses of `pairs`.
-fn edges_of(photos: &[PosePhoto], pairs: Vec<[usize; 2]>, seed: u64) -> Vec<Edge> {
-    pairs
-        .into_par_iter()
-        .filter_map(|[i, j]| {
-            let estimate = pair::estimate(&photos[i], &photos[j], false, seed).ok()?;
-            let enough = estimate.consistent >= MIN_PAIR_CONSISTENT
-                && estimate.inliers.len() >= MIN_PAIR_INLIERS;
-            enough.then_some(Edge { photos: [i, j], estimate })
-        })
-        .collect()
-}
-
-/// Estimates the shared focal length of photographs whose lenses are not exact, over that of the
-/// lenses: the weighted median of the estimates of the pairs with most matches.
-pub(super) fn focal_scale(photos: &[PosePhoto], seed: u64) -> f64 {
-    /// Number of pairs that vote.
-    const VOTES: usize = 8;
-    let sketches: Vec<_> = photos.par_iter().map(|p| p.features.strongest(SKETCH)).collect();
-    let mut alike: Vec<(usize, [usize; 2])> = compared(photos)
-        .into_par_iter()
-        .map(|[i, j]| {
-            (crate::cameras::matches::pairs::pairs(&sketches[i], &sketches[j]).len(), [i, j])
-        })
-        .collect();
-    alike.sort_by_key(|(n, pair)| (std::cmp::Reverse(*n), *pair));
-    // Neighbours of a video have many matches and little parallax: every second pair counts.
-    let step = (alike.len() / (2 * VOTES)).clamp(1, 3);
-    let mut votes: Vec<(f64, f64)> = alike
-        .iter()
-        .step_by(step)
-        .take(VOTES)
-        .collect::<Vec<_>>()
-        .into_par_iter()
-        .filter_map(|(_, [i, j])| {
-            let e = pair::estimate(&photos[*i], &photos[*j], false, seed).ok()?;
-            let weight =
-                e.refined.information.lu().try_inverse().map_or(0.0, |c| 1.0 / c[(5, 5)].max(1e-6));
-            (e.consistent >= MIN_PAIR_INLIERS).then_some((e.refined.focal_scale, weight.sqrt()))
-        })
-        .collect();
-    votes.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let total: f64 = votes.iter().map(|v| v.1).sum();
-    let mut sum = 0.0;
-    votes
-        .iter()
-        .find(|v| {
-            sum += v.1;
-            sum >= 0.5 * total
-        })
-        .map_or(1.0, |v| v.0)
 }
 
 /// The growing model.

@@ -2,6 +2,7 @@
 
 mod converted;
 mod decode;
+pub mod distortion;
 pub mod exif;
 pub mod folder;
 mod heic;

@@ -45,7 +45,8 @@ pub(super) enum Turned {
 
 /// A program with its arguments. It runs in the folder of `IN` and `OUT`.
 struct Program {
-    name: &'static str,
+    /// The name, and earlier ones.
+    names: &'static [&'static str],
     kinds: &'static [Kind],
     arguments: &'static [&'static str],
     /// Names of the result.
@@ -62,28 +63,21 @@ const PNG: &[&str] = &["out.png", "out-1.png"];
 const PROGRAMS: &[Program] = &[
     // Of libheif; `heif-convert` is the name before version 1.18.
     Program {
-        name: "heif-dec",
+        names: &["heif-dec", "heif-convert"],
         kinds: &[Kind::Heic, Kind::Avif],
         arguments: &[IN, "out.png"],
         outputs: PNG,
         turned: Turned::Upright,
     },
     Program {
-        name: "heif-convert",
-        kinds: &[Kind::Heic, Kind::Avif],
-        arguments: &[IN, "out.png"],
-        outputs: PNG,
-        turned: Turned::Upright,
-    },
-    Program {
-        name: "avifdec",
+        names: &["avifdec"],
         kinds: &[Kind::Avif],
         arguments: &[IN, "out.png"],
         outputs: PNG,
         turned: Turned::Unknown,
     },
     Program {
-        name: "djxl",
+        names: &["djxl"],
         kinds: &[Kind::Jxl],
         arguments: &[IN, "out.png"],
         outputs: PNG,
@@ -91,7 +85,7 @@ const PROGRAMS: &[Program] = &[
     },
     // Of macOS. TIFF: without loss, with the profile and a defined orientation tag.
     Program {
-        name: "sips",
+        names: &["sips"],
         kinds: &[Kind::Heic, Kind::Avif, Kind::Jxl, Kind::Raw],
         arguments: &["-s", "format", "tiff", IN, "--out", "out.tif"],
         outputs: &["out.tif"],
@@ -99,14 +93,14 @@ const PROGRAMS: &[Program] = &[
     },
     // Of LibRaw: white balance of the camera, sRGB, the same brightness for all pictures.
     Program {
-        name: "dcraw_emu",
+        names: &["dcraw_emu"],
         kinds: &[Kind::Raw],
         arguments: &["-w", "-W", "-o", "1", "-T", IN],
         outputs: &["in.raw.tiff", "in.tiff"],
         turned: Turned::Upright,
     },
     Program {
-        name: "dcraw",
+        names: &["dcraw"],
         kinds: &[Kind::Raw],
         arguments: &["-w", "-W", "-o", "1", "-T", IN],
         outputs: &["in.tiff"],
@@ -114,7 +108,7 @@ const PROGRAMS: &[Program] = &[
     },
     // ImageMagick. `convert` is not searched: Windows has another program of this name.
     Program {
-        name: "magick",
+        names: &["magick"],
         kinds: &[Kind::Heic, Kind::Avif, Kind::Jxl],
         arguments: &[IN, "out.png"],
         outputs: &["out.png", "out-0.png"],
@@ -122,7 +116,7 @@ const PROGRAMS: &[Program] = &[
     },
     // Versions before 7 know no tiles: the size tells.
     Program {
-        name: "ffmpeg",
+        names: &["ffmpeg"],
         kinds: &[Kind::Heic, Kind::Avif, Kind::Jxl],
         arguments: &[
             "-nostdin",
@@ -164,7 +158,8 @@ pub(super) struct Output {
 /// Programs of this computer that convert `kind`.
 pub(super) struct Installed {
     kind: Kind,
-    found: Vec<(&'static Program, PathBuf)>,
+    /// Programs with the names under which they were found.
+    found: Vec<(&'static Program, &'static str, PathBuf)>,
     time_limit: Duration,
 }
 
@@ -188,13 +183,14 @@ thread_local! {
 /// where the photographs are.
 fn installed_in(kind: Kind, path: &OsStr) -> Installed {
     let of_kind = PROGRAMS.iter().filter(|program| program.kinds.contains(&kind));
-    let file = |program: &'static Program| {
-        let name = format!("{}{}", program.name, std::env::consts::EXE_SUFFIX);
+    let named = of_kind.flat_map(|program| program.names.iter().map(move |name| (program, *name)));
+    let file = |(program, name): (&'static Program, &'static str)| {
+        let file = format!("{name}{}", std::env::consts::EXE_SUFFIX);
         let folders = std::env::split_paths(path).filter(|folder| folder.is_absolute());
-        let place = folders.map(|folder| folder.join(&name)).find(|file| is_program(file))?;
-        Some((program, place))
+        let place = folders.map(|folder| folder.join(&file)).find(|file| is_program(file))?;
+        Some((program, name, place))
     };
-    Installed { kind, found: of_kind.filter_map(file).collect(), time_limit: TIME_LIMIT }
+    Installed { kind, found: named.filter_map(file).collect(), time_limit: TIME_LIMIT }
 }
 
 #[cfg(unix)]
@@ -224,16 +220,19 @@ impl Installed {
         mut accept: impl FnMut(Output) -> Result<T, String>,
     ) -> Result<T, String> {
         let mut reasons = Vec::new();
-        for (program, file) in &self.found {
-            match self.run(program, file, picture).and_then(&mut accept) {
+        for (program, name, file) in &self.found {
+            let made = self.run(program, file, picture);
+            let output = made.map(|bytes| Output { bytes, program: name, turned: program.turned });
+            match output.and_then(&mut accept) {
                 Ok(accepted) => return Ok(accepted),
-                Err(reason) => reasons.push(format!("{}: {reason}", program.name)),
+                Err(reason) => reasons.push(format!("{name}: {reason}")),
             }
         }
         Err(reasons.join("; "))
     }
 
-    fn run(&self, program: &Program, file: &Path, picture: &[u8]) -> Result<Output, String> {
+    /// The picture that a program writes.
+    fn run(&self, program: &Program, file: &Path, picture: &[u8]) -> Result<Vec<u8>, String> {
         let system = |error: std::io::Error| error.to_string();
         // Readable for the user alone, and removed at the end.
         let folder = tempfile::tempdir().map_err(system)?;
@@ -251,8 +250,7 @@ impl Installed {
         let Some(output) = output.filter(|_| success) else {
             return Err(last_line(messages).unwrap_or_else(|| "it wrote no picture".to_owned()));
         };
-        let bytes = std::fs::read(output).map_err(system)?;
-        Ok(Output { bytes, program: program.name, turned: program.turned })
+        std::fs::read(output).map_err(system)
     }
 }
 

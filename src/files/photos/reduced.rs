@@ -13,7 +13,7 @@
 use super::image::MAX_PIXELS;
 use super::jpeg;
 use crate::files::{Error, Result};
-use image::{DynamicImage, ImageBuffer, ImageFormat};
+use image::{DynamicImage, ImageBuffer, ImageFormat, Luma, LumaA, Pixel, Primitive, Rgb, Rgba};
 use std::io::Cursor;
 use std::path::Path;
 
@@ -92,25 +92,24 @@ fn decode_jpeg(bytes: &[u8], factor: u32) -> Decoded {
         return Err(format!("{}x{} pixels in place of {width}x{height}", found.0, found.1));
     }
     let pixels = decoder.decode().map_err(|e| e.to_string())?;
-    image_8(width, height, usize::from(components), pixels)
+    picture([width, height], usize::from(components), pixels)
 }
 
-fn image_8(width: u32, height: u32, channels: usize, data: Vec<u8>) -> Decoded {
+/// A picture of 1 to 4 channels.
+fn picture<T: Primitive>([width, height]: [u32; 2], channels: usize, data: Vec<T>) -> Decoded
+where
+    Rgb<T>: Pixel<Subpixel = T>,
+    Rgba<T>: Pixel<Subpixel = T>,
+    DynamicImage: From<ImageBuffer<Luma<T>, Vec<T>>>
+        + From<ImageBuffer<LumaA<T>, Vec<T>>>
+        + From<ImageBuffer<Rgb<T>, Vec<T>>>
+        + From<ImageBuffer<Rgba<T>, Vec<T>>>,
+{
     let made = match channels {
-        1 => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageLuma8),
-        2 => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageLumaA8),
-        3 => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageRgb8),
-        _ => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageRgba8),
-    };
-    made.ok_or_else(|| "another number of pixels than the file states".to_owned())
-}
-
-fn image_16(width: u32, height: u32, channels: usize, data: Vec<u16>) -> Decoded {
-    let made = match channels {
-        1 => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageLuma16),
-        2 => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageLumaA16),
-        3 => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageRgb16),
-        _ => ImageBuffer::from_raw(width, height, data).map(DynamicImage::ImageRgba16),
+        1 => ImageBuffer::<Luma<T>, _>::from_raw(width, height, data).map(DynamicImage::from),
+        2 => ImageBuffer::<LumaA<T>, _>::from_raw(width, height, data).map(DynamicImage::from),
+        3 => ImageBuffer::<Rgb<T>, _>::from_raw(width, height, data).map(DynamicImage::from),
+        _ => ImageBuffer::<Rgba<T>, _>::from_raw(width, height, data).map(DynamicImage::from),
     };
     made.ok_or_else(|| "another number of pixels than the file states".to_owned())
 }
@@ -188,10 +187,10 @@ impl AnyMeans {
         }
     }
 
-    fn finish(self, [width, height]: [u32; 2]) -> Decoded {
+    fn finish(self, size: [u32; 2]) -> Decoded {
         match self {
-            Self::Eight(m) => image_8(width, height, m.channels, m.finish()),
-            Self::Sixteen(m) => image_16(width, height, m.channels, m.finish()),
+            Self::Eight(m) => picture(size, m.channels, m.finish()),
+            Self::Sixteen(m) => picture(size, m.channels, m.finish()),
         }
     }
 }

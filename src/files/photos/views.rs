@@ -11,7 +11,8 @@
 //!
 //! A view has the panorama's pixels per degree in its middle.
 
-use super::undistort::{Distortion, Edge, border, ray, resample, resample_masked};
+use super::distortion::Distortion;
+use super::undistort::{Edge, border, ray, resample, resample_masked};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::{DMat3, DVec2, DVec3};

@@ -5,9 +5,9 @@ use super::notes::Notes;
 use super::panoramas::{self, DraftView};
 use super::reading::{Folders, Reading};
 use super::scene::{Frame, LeftOut, Pixels, Scene, SceneFormat, Units};
+use crate::files::photos::distortion::Distortion;
 use crate::files::photos::image::{Probe, probe};
 use crate::files::photos::masks;
-use crate::files::photos::undistort::Distortion;
 use crate::files::{Error, Result};
 use glam::{DMat3, DMat4, DVec3};
 use rayon::prelude::*;
@@ -24,6 +24,8 @@ pub(super) enum Lens {
     Normalised([f64; 4]),
     /// One focal length in pixels of the stored picture; the principal point is its middle.
     Centred(f64),
+    /// One focal length and the principal point's offset from the picture's middle, divided by its larger side.
+    LargerSide([f64; 3]),
 }
 
 /// A frame before its picture's header is read.
@@ -272,6 +274,10 @@ fn stored_intrinsics(
     let (w, h) = (stored.width as f64, stored.height as f64);
     let (k, rescaled) = match draft.lens {
         Lens::Centred(focal) => ([focal, focal, 0.5 * w, 0.5 * h], false),
+        Lens::LargerSide([focal, x, y]) => {
+            let side = w.max(h);
+            ([focal * side, focal * side, 0.5 * w + x * side, 0.5 * h + y * side], false)
+        }
         Lens::Normalised(k) => ([k[0] * w, k[1] * h, k[2] * w, k[3] * h], false),
         Lens::Pixels(k) => {
             let (given_w, given_h) = draft.size.unwrap_or((stored.width, stored.height));
@@ -518,7 +524,7 @@ fn view_intrinsics(draft: &Draft, view: &DraftView) -> Intrinsics {
             let [fx, fy, cx, cy] = lens.map(|v| v as f32);
             Intrinsics { fx, fy, cx, cy, ..k }
         }
-        Lens::Normalised(_) | Lens::Centred(_) => k,
+        Lens::Normalised(_) | Lens::Centred(_) | Lens::LargerSide(_) => k,
     }
 }
 

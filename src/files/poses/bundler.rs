@@ -12,7 +12,7 @@ use super::json::utf8;
 use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
 use super::transforms::opengl_to_opencv;
-use crate::files::photos::undistort::Distortion;
+use crate::files::photos::distortion::Distortion;
 use crate::files::{Error, Result, read};
 use glam::{DMat3, DMat4, DVec3};
 use std::path::{Path, PathBuf};

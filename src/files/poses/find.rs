@@ -6,23 +6,26 @@
 //! 2. COLMAP models in `sparse`, `colmap/sparse`, the folder itself and `dense`, and in their numbered folders
 //! 3. a RealEstate10K txt
 //! 4. `poses.txt` with `K.txt`
-//! 5. the cameras of OpenSfM, Polycam, Record3D, Bundler and LLFF
+//! 5. the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML) and RealityCapture (CSV)
 //! 6. a list of `ns-export cameras` where the pictures state their focal lengths
 //! 7. a JSON file of any other name with the content of one of the files above
 
 use super::assemble::{entries, files};
-use super::{bundler, colmap, llff, nerfstudio, opensfm, polycam, re10k};
+use super::{
+    bundler, colmap, llff, metashape, nerfstudio, opensfm, polycam, re10k, reality_capture,
+};
 use crate::files::photos::photograph::list_photographs;
-use crate::files::{Result, read};
+use crate::files::{Result, lower_extension, read};
 use std::path::{Path, PathBuf};
 
 /// JSON files with cameras, in the order of preference; the others are parts of the same scene.
-const JSON_FILES: [&str; 5] = [
+const JSON_FILES: [&str; 6] = [
     "cameras.json",
     "transforms.json",
     "transforms_train.json",
     "transforms_val.json",
     "transforms_test.json",
+    "transforms_eval.json",
 ];
 /// Folders in which COLMAP models may lie, themselves or in numbered folders of theirs.
 const MODEL_FOLDERS: [&str; 4] = ["sparse", "colmap/sparse", "", "dense"];
@@ -30,6 +33,12 @@ const MODEL_FOLDERS: [&str; 4] = ["sparse", "colmap/sparse", "", "dense"];
 const NOT_READ: [(&str, &str); 2] = [
     ("camera_path.json", "a path of nerfstudio's viewer, which has no photographs"),
     ("project.files", "a Metashape project"),
+];
+/// Projects whose cameras are read when their program has exported them: extension, maker and export.
+const PROJECTS: [[&str; 3]; 3] = [
+    ["psx", "a Metashape project", "XML"],
+    ["rcproj", "a RealityCapture project", "CSV"],
+    ["rsproj", "a RealityScan project", "CSV"],
 ];
 /// Files of Bundler, from the folder of the scene.
 const BUNDLER_FILES: [&str; 3] = ["bundle.out", "bundle/bundle.out", "bundler/bundle.out"];
@@ -64,6 +73,10 @@ pub(super) enum PoseFile {
     Bundler(PathBuf),
     /// `poses_bounds.npy` of LLFF.
     Llff(PathBuf),
+    /// XML of Metashape.
+    Metashape(PathBuf),
+    /// CSV of RealityCapture.
+    RealityCapture(PathBuf),
     /// List or path of nerfstudio.
     Nerfstudio(PathBuf),
 }
@@ -80,6 +93,8 @@ impl PoseFile {
             Self::Record3d(path) => length_of(path, "poses"),
             Self::Bundler(path) => bundler::count(path),
             Self::Llff(path) => llff::count(path),
+            Self::Metashape(path) => metashape::count(path),
+            Self::RealityCapture(path) => reality_capture::count(path),
             Self::Nerfstudio(path) => {
                 cameras_of_json(path, true).unwrap_or_else(|| length_of(path, "camera_path"))
             }
@@ -93,6 +108,7 @@ impl PoseFile {
             }
             Self::OpenSfm(path) | Self::Polycam(path) | Self::Record3d(path) => path,
             Self::Bundler(path) | Self::Llff(path) | Self::Nerfstudio(path) => path,
+            Self::Metashape(path) | Self::RealityCapture(path) => path,
         }
     }
 }
@@ -176,6 +192,14 @@ fn cameras_not_read(folder: &Path) -> Option<String> {
         .iter()
         .find(|(path, _)| folder.join(path).exists())
         .map(|(path, maker)| format!("{path} ({maker})"));
+    let of_project = |path: PathBuf| {
+        let extension = lower_extension(&path);
+        let [_, maker, export] = PROJECTS.into_iter().find(|[own, ..]| *own == extension)?;
+        Some((path, maker, export))
+    };
+    if let Some((path, maker, export)) = files(folder).into_iter().find_map(of_project) {
+        return Some(format!("{} is {maker}: export its cameras as {export}", path.display()));
+    }
     let list = JSON_FILES[1..].iter().find(|file| is_list(file));
     let list = list.map(|file| format!("{file} (a list of poses without focal lengths)"));
     let cameras = list.or(there)?;
@@ -259,10 +283,31 @@ fn foreign(folder: &Path) -> Vec<(PoseFile, &'static str)> {
     if path.is_file() {
         all.push((PoseFile::Llff(path), "LLFF"));
     }
+    let exports = by_content(folder, "xml", metashape::is_export, PoseFile::Metashape);
+    all.extend(exports.into_iter().map(|file| (file, "Metashape")));
+    let tables = by_content(folder, "csv", reality_capture::is_table, PoseFile::RealityCapture);
+    all.extend(tables.into_iter().map(|file| (file, "RealityCapture")));
     let lists = JSON_FILES[1..].iter().map(|name| folder.join(name));
     let mut lists = lists.filter(|path| is_kind(path, &PoseFile::Nerfstudio));
     if let Some(path) = lists.find(|path| nerfstudio::has_focal_lengths(path)) {
         all.push((PoseFile::Nerfstudio(path), "nerfstudio"));
+    }
+    all
+}
+
+/// Files of a folder with an extension and with the content of a kind: the one with most cameras first.
+fn by_content(
+    folder: &Path,
+    extension: &str,
+    is_kind: fn(&Path) -> bool,
+    make: fn(PathBuf) -> PoseFile,
+) -> Vec<PoseFile> {
+    let mut all = files(folder);
+    all.retain(|path| lower_extension(path) == extension);
+    all.retain(|path| is_kind(path));
+    let mut all: Vec<PoseFile> = all.into_iter().map(make).collect();
+    if all.len() > 1 {
+        all.sort_by_cached_key(|file| std::cmp::Reverse(file.cameras()));
     }
     all
 }
@@ -291,7 +336,7 @@ pub(super) fn foreign_json(path: &Path) -> Option<PoseFile> {
 fn any_json(folder: &Path) -> Option<PoseFile> {
     let (most, largest) = JSON_MAX;
     let mut all = files(folder);
-    all.retain(|path| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")));
+    all.retain(|path| lower_extension(path) == "json");
     all.retain(|path| path.metadata().is_ok_and(|file| file.len() <= largest));
     let mut found: Vec<PoseFile> =
         all.iter().take(most).filter_map(|path| kind_of_json(path)).collect();

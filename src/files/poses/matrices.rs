@@ -5,6 +5,7 @@
 //! White space, commas and brackets separate numbers; `#` begins a comment.
 
 use super::assemble::{Draft, Lens, Pictures, assemble};
+use super::json::utf8;
 use super::reading::{Reading, SceneOptions};
 use super::scene::{Scene, SceneFormat};
 use super::transforms::opengl_to_opencv;
@@ -79,7 +80,7 @@ pub fn parse_intrinsics(text: &str) -> std::result::Result<[f64; 4], String> {
 }
 
 fn text(path: &Path) -> Result<String> {
-    String::from_utf8(read(path)?).map_err(|e| {
+    String::from_utf8(utf8(&read(path)?).into_owned()).map_err(|e| {
         let at = format!(" at byte {}", e.utf8_error().valid_up_to());
         Error::format(path, "UTF-8 text", "other bytes").at(at)
     })

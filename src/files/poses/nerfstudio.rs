@@ -3,9 +3,12 @@
 //! * `ns-export cameras`: a list of `file_path` and `transform`, a 3×4 matrix. The list has no focal lengths: they
 //!   come from the pictures' EXIF data.
 //! * `camera_path.json` of the viewer: `camera_path` with `camera_to_world` (16 numbers by rows) and `fov`, the
-//!   angle of view from top to bottom in degrees; `render_width` and `render_height`. It has no pictures.
+//!   angle of view from top to bottom in degrees; `render_width` and `render_height`. It has no pictures. Paths of
+//!   fisheye and equirectangular views are refused.
 //!
-//! Matrices are OpenGL camera-to-world. Source: nerfstudio, `scripts/exporter.py` and `cameras/camera_paths.py`.
+//! Matrices are OpenGL camera-to-world. Source: nerfstudio, `scripts/exporter.py` (`ExportCameraPoses`),
+//! `exporter/exporter_utils.py` (`collect_camera_poses_for_dataset`) and `cameras/camera_paths.py`
+//! (`get_path_from_json`).
 
 use super::assemble::{Draft, Lens, Pictures, assemble};
 use super::cameras_json::{matrix, side};
@@ -32,6 +35,7 @@ struct CameraPath {
     camera_path: Vec<PathCamera>,
     render_width: f64,
     render_height: f64,
+    camera_type: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -66,6 +70,12 @@ pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
         return assemble(path, SceneFormat::Nerfstudio, &reading.needed(), drafts.collect());
     }
     let file: CameraPath = json::parse(path, &bytes, "a camera path of nerfstudio's viewer")?;
+    // get_path_from_json takes every other word for a perspective.
+    let kind = file.camera_type.as_deref().unwrap_or_default();
+    if matches!(kind, "fisheye" | "equirectangular") {
+        let expected = "a path with the camera_type perspective";
+        return Err(Error::format(path, expected, format!("`{kind}`")));
+    }
     let (Some(w), Some(h)) = (side(file.render_width), side(file.render_height)) else {
         let got = format!("{}x{}", file.render_width, file.render_height);
         return Err(Error::format(path, "render_width and render_height in whole pixels", got));

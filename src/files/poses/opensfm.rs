@@ -10,7 +10,7 @@ use super::cameras_json::side;
 use super::json;
 use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
-use crate::files::photos::undistort::Distortion;
+use crate::files::photos::distortion::Distortion;
 use crate::files::{Error, Result, read};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Deserialize;

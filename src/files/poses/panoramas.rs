@@ -2,8 +2,8 @@
 //! in directions that all panoramas of the scene share ([`crate::files::photos::views`]).
 
 use super::assemble::{Draft, Lens, orthonormal};
+use crate::files::photos::distortion::Distortion;
 use crate::files::photos::image::Probe;
-use crate::files::photos::undistort::Distortion;
 use crate::files::photos::views::{Cut, has_panorama_shape, panorama_cut, shared_axes, view_label};
 use crate::files::{Error, Result};
 use glam::{DMat3, DMat4, DVec3};

@@ -15,6 +15,7 @@
 //! 4. by time stamp, if some names are time stamps.
 
 use super::assemble::{Draft, Lens, assemble};
+use super::json::utf8;
 use super::reading::Reading;
 use super::scene::{Scene, SceneFormat, Units};
 use crate::files::{Error, Result, read};
@@ -46,7 +47,7 @@ pub fn parse(
     bytes: &[u8],
     warnings: &mut Vec<String>,
 ) -> Result<Vec<Re10kCamera>> {
-    cameras(path.as_ref(), bytes, warnings)
+    cameras(path.as_ref(), &utf8(bytes), warnings)
 }
 
 fn cameras(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Vec<Re10kCamera>> {
@@ -107,6 +108,7 @@ pub(super) fn find(folder: &Path) -> Result<Option<PathBuf>> {
             return false;
         }
         let Ok(bytes) = read(p) else { return false };
+        let bytes = utf8(&bytes);
         let text = String::from_utf8_lossy(&bytes);
         let mut lines = text.lines().filter(|l| !l.trim().is_empty());
         let Some(first) = lines.next() else { return false };

@@ -37,7 +37,7 @@ pub(super) struct Reading<'a> {
     /// The scene's folder, where the pose file may lie elsewhere.
     folder: Option<&'a Path>,
     folders: Folders,
-    /// Pictures of `images` that were found by a part of their path, with that path.
+    /// Pictures that were found by a part of their path, with that path.
     taken: RefCell<HashMap<PathBuf, String>>,
 }
 
@@ -77,23 +77,32 @@ impl<'a> Reading<'a> {
     /// scene's folder.
     pub fn find(&self, roots: &[&Path], name: &str) -> Option<PathBuf> {
         if let Some(images) = self.images {
-            return self.find_below(images, name);
+            return self.find_below(&[images], name);
         }
         find_image_in(&self.folders, roots, name)
             .or_else(|| find_image_in(&self.folders, &[self.folder?], name))
     }
 
-    /// Searches in `images` by the path of a pose file, then by the path without its first folders. Two entries
+    /// Searches as [`Self::find`] does, then for the path without its first folders, which may be those of another
+    /// machine. Two entries do not find one picture in the second way.
+    pub fn find_by_end(&self, roots: &[&Path], name: &str) -> Option<PathBuf> {
+        if let Some(images) = self.images {
+            return self.find_below(&[images], name);
+        }
+        self.find_below(roots, name).or_else(|| self.find_below(&[self.folder?], name))
+    }
+
+    /// Searches below `roots` by the path of a pose file, then by the path without its first folders. Two entries
     /// do not find one picture in the second way.
-    fn find_below(&self, images: &Path, name: &str) -> Option<PathBuf> {
+    fn find_below(&self, roots: &[&Path], name: &str) -> Option<PathBuf> {
         let name = name.replace('\\', "/");
-        if let Some(found) = find_image_in(&self.folders, &[images], &name) {
+        if let Some(found) = find_image_in(&self.folders, roots, &name) {
             return Some(found);
         }
         let mut rest = name.as_str();
         while let Some((_, inner)) = rest.split_once('/') {
             rest = inner;
-            if let Some(found) = find_image_in(&self.folders, &[images], rest) {
+            if let Some(found) = find_image_in(&self.folders, roots, rest) {
                 let mut taken = self.taken.borrow_mut();
                 let first = taken.entry(found.clone()).or_insert_with(|| name.clone());
                 return (*first == name).then_some(found);

@@ -15,13 +15,14 @@ use super::find::{Found, PoseFile, find, find_in, not_read};
 use super::panoramas::DraftView;
 use super::reading::{Reading, SceneOptions};
 use super::{
-    bundler, cameras_json, colmap, find, llff, matrices, nerfstudio, opensfm, polycam, re10k,
-    record3d, transforms,
+    bundler, cameras_json, colmap, find, llff, matrices, metashape, nerfstudio, opensfm, polycam,
+    re10k, reality_capture, record3d, transforms,
 };
+use crate::files::photos::distortion::Distortion;
 use crate::files::photos::image::{LoadOptions, LoadedPicture, load_with, probe};
 use crate::files::photos::masks;
 use crate::files::photos::photograph::{Photograph, load_photograph, load_photograph_or_panorama};
-use crate::files::photos::undistort::{Distortion, pinhole, undistort, undistort_masked};
+use crate::files::photos::undistort::{pinhole, undistort, undistort_masked};
 use crate::files::photos::views::Cut;
 use crate::files::{Error, Result, lower_extension};
 use crate::scene::mask::Mask;
@@ -56,6 +57,10 @@ pub enum SceneFormat {
     Bundler,
     /// LLFF's `poses_bounds.npy`.
     Llff,
+    /// Metashape's cameras as XML.
+    Metashape,
+    /// RealityCapture's table of cameras.
+    RealityCapture,
     /// A list of poses of `ns-export cameras`, or a path of nerfstudio's viewer.
     Nerfstudio,
     /// Two pictures with cameras from the command line.
@@ -78,6 +83,8 @@ impl SceneFormat {
             Self::Record3d => "Record3D",
             Self::Bundler => "Bundler",
             Self::Llff => "LLFF's poses_bounds.npy",
+            Self::Metashape => "Metashape's XML",
+            Self::RealityCapture => "RealityCapture's CSV",
             Self::Nerfstudio => "nerfstudio's list of cameras",
             Self::Pair => "two pictures with given cameras",
             Self::Photographs => "photographs with estimated cameras",
@@ -153,6 +160,8 @@ pub struct LoadedFrame {
     pub mask: Option<Mask>,
     /// Pinhole camera of the picture.
     pub camera: Camera,
+    /// The picture of which this is a view ([`Frame::cut`]); `None` for a whole picture.
+    pub view_of: Option<PathBuf>,
     /// Warnings about the file, one line each, with its path.
     pub warnings: Vec<String>,
 }
@@ -216,7 +225,8 @@ impl Frame {
         if let Some(cut) = &self.cut {
             let (picture, mask) = cut.apply(&picture, mask.as_ref());
             let mask = masks::checked(mask, &self.image)?;
-            return Ok(LoadedFrame { picture, mask, camera: self.camera, warnings });
+            let view_of = Some(self.image.clone());
+            return Ok(LoadedFrame { picture, mask, camera: self.camera, view_of, warnings });
         }
         let camera = self.pinhole()?;
         let (picture, mask) = match (self.distortion, mask) {
@@ -228,7 +238,7 @@ impl Frame {
                 (picture, masks::checked(mask, &self.image)?)
             }
         };
-        Ok(LoadedFrame { picture, mask, camera, warnings })
+        Ok(LoadedFrame { picture, mask, camera, view_of: None, warnings })
     }
 }
 
@@ -467,7 +477,7 @@ fn load_at(path: &Path, pictures: Pictures, options: &SceneOptions) -> Result<Sc
 
 /// For messages: the pose files of a folder.
 pub(super) const SCENES: &str = "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, poses.txt with K.txt, or \
-     the cameras of OpenSfM, Polycam, Record3D, Bundler or LLFF";
+     the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML) or RealityCapture (CSV)";
 
 /// Reads the pose file or the folder of one that [`SceneOptions::model`] names.
 fn load_model(model: &Path, reading: &Reading<'_>) -> Result<Scene> {
@@ -492,6 +502,8 @@ fn load_found(file: &PoseFile, reading: &Reading<'_>) -> Result<Scene> {
         PoseFile::Record3d(file) => record3d::load(file, reading),
         PoseFile::Bundler(file) => bundler::load(file, reading),
         PoseFile::Llff(file) => llff::load(file, reading),
+        PoseFile::Metashape(file) => metashape::load(file, reading),
+        PoseFile::RealityCapture(file) => reality_capture::load(file, reading),
         PoseFile::Nerfstudio(file) => nerfstudio::load(file, reading),
     }
 }
@@ -518,6 +530,8 @@ fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
         },
         (_, "npy") => llff::load(path, reading),
         (_, "out") => bundler::load(path, reading),
+        (_, "xml") => metashape::load(path, reading),
+        (_, "csv") => reality_capture::load(path, reading),
         ("cameras.txt" | "images.txt" | "points3d.txt", _) | (_, "bin") => {
             colmap::load(folder, reading)
         }
@@ -525,7 +539,7 @@ fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
         (_, "txt") => re10k::load(path, reading),
         _ => Err(Error::format(
             path,
-            "a folder or a pose file (.json, .txt, .bin, .npy, .out)",
+            "a folder or a pose file (.json, .txt, .bin, .npy, .out, .xml, .csv)",
             format!("a file with extension `{extension}`"),
         )),
     }

@@ -14,7 +14,7 @@ use super::json;
 use super::matrices::PoseConvention;
 use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
-use crate::files::photos::undistort::Distortion;
+use crate::files::photos::distortion::Distortion;
 use crate::files::photos::views::panorama_intrinsics;
 use crate::files::{Error, Result, read};
 use glam::{DMat4, DVec4};

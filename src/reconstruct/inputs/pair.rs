@@ -368,7 +368,7 @@ pub fn quantile(values: &mut [f32], q: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::files::photos::undistort::Distortion;
+    use crate::files::photos::distortion::Distortion;
     use crate::files::poses::scene::{Frame, Pixels, SceneFormat};
     use glam::{Mat4, Quat};
     use subsplat_kernels::camera::Intrinsics;

@@ -1,3 +1,4 @@
+use super::super::pair::PairEstimate;
 use super::super::photo::Lens;
 use super::super::refine::Refined;
 use super::super::two_view::{Bearings, Relative, rotation};

@@ -18,7 +18,7 @@ mod write;
 use super::assemble::{Draft, Lens, assemble};
 use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
-use crate::files::photos::undistort::Distortion;
+use crate::files::photos::distortion::Distortion;
 use crate::files::photos::views::panorama_intrinsics;
 use crate::files::{Error, Result, read};
 use glam::{DMat4, DQuat, DVec3};

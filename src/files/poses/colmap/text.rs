@@ -1,10 +1,12 @@
-//! COLMAP's text files: `#` comments, one record a line (two in `images.txt`).
+//! COLMAP's text files: `#` comments, one record a line (two in `images.txt`), in UTF-8, or in UTF-16 with a byte
+//! order mark.
 //!
 //! * `cameras.txt`: CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
 //! * `images.txt`: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of
 //!   X Y POINT3D_ID triples, which may be empty, and which some exporters leave out
 //! * `points3D.txt`: POINT3D_ID X Y Z R G B ERROR TRACK…
 
+use super::super::json::utf8;
 use super::{Cameras, ColmapCamera, ColmapImage, MODELS, Points, camera, pose};
 use crate::files::{Error, Result};
 use glam::DVec3;
@@ -63,7 +65,6 @@ fn lines<'a>(path: &'a Path, bytes: &'a [u8]) -> Result<Vec<Line<'a>>> {
         let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
         Error::format(path, "UTF-8 text", "other bytes").at(format!(":{line}"))
     })?;
-    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
     let line = |(i, text): (usize, &'a str)| Line { path, number: i + 1, text: text.trim() };
     Ok(text.lines().enumerate().map(line).collect())
 }
@@ -79,7 +80,7 @@ fn records<'a>(path: &'a Path, bytes: &'a [u8]) -> Result<impl Iterator<Item = L
 /// A line without an id, an id twice. A camera model that is not read, and parameters that do not parse, are
 /// errors of that camera.
 pub fn parse_cameras(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Cameras> {
-    cameras(path.as_ref(), bytes)
+    cameras(path.as_ref(), &utf8(bytes))
 }
 
 fn cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
@@ -141,7 +142,7 @@ pub fn parse_images(
     bytes: &[u8],
     warnings: &mut Vec<String>,
 ) -> Result<Vec<ColmapImage>> {
-    images(path.as_ref(), bytes, warnings)
+    images(path.as_ref(), &utf8(bytes), warnings)
 }
 
 fn images(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Vec<ColmapImage>> {
@@ -207,7 +208,7 @@ fn image(line: Line<'_>) -> Result<ColmapImage> {
 /// # Errors
 /// A line that does not parse.
 pub fn parse_points(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Points> {
-    points(path.as_ref(), bytes)
+    points(path.as_ref(), &utf8(bytes))
 }
 
 fn points(path: &Path, bytes: &[u8]) -> Result<Points> {

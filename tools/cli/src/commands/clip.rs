@@ -1,6 +1,7 @@
 //! A video as input: frames of it become a folder of photographs, which the command then reads.
 
 use super::args::{PathArg, PosesArgs, RunArgs};
+use super::output;
 use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use indicatif::ProgressBar;
@@ -18,15 +19,33 @@ const FRAMES: (usize, usize) = (2, 100);
 /// Folder of the frames in the output folder.
 const FOLDER: &str = "frames";
 
+/// Arguments that read the frames of a video.
+pub struct OfVideo<A> {
+    /// The arguments.
+    pub args: A,
+    /// The video.
+    pub video: PathBuf,
+}
+
+impl<A> OfVideo<A> {
+    /// Name of the scene: that of the video.
+    pub fn scene_name(&self) -> String {
+        self.video.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+}
+
 /// Arguments of `run` that read the frames of a video, where the input is one.
 ///
 /// # Errors
-/// Those of [`video_of`] and of the library's `take_frames`; `--take` without a video; a number out of its range.
-pub fn of_run(args: &RunArgs, progress: &mut Progress) -> Result<Option<RunArgs>> {
+/// Those of [`video_of`] and of the library's `take_frames`; `--take` without a video; a number out of its range;
+/// an output folder that cannot be used.
+pub fn of_run(args: &RunArgs, progress: &mut Progress) -> Result<Option<OfVideo<RunArgs>>> {
     let Some(video) = video_of(&args.input)? else {
         ensure!(args.take.is_none(), "--take: only with a video, got photographs or a scene");
         return Ok(None);
     };
+    // The frames are written into this folder.
+    output::check(&args.out)?;
     let mut frames = args.clone();
     let count = match args.take {
         // Without a path, --frames has no other meaning for a video.
@@ -36,19 +55,24 @@ pub fn of_run(args: &RunArgs, progress: &mut Progress) -> Result<Option<RunArgs>
         take => take.map(|count| ("--take", count)),
     };
     frames.input = vec![take(&video, &args.out.join(FOLDER), count, progress)?];
-    Ok(Some(frames))
+    Ok(Some(OfVideo { args: frames, video }))
 }
 
 /// Arguments of `poses` that read the frames of a video, where the input is one.
 ///
 /// # Errors
 /// As [`of_run`].
-pub fn of_poses(args: &PosesArgs, progress: &mut Progress) -> Result<Option<PosesArgs>> {
+pub fn of_poses(args: &PosesArgs, progress: &mut Progress) -> Result<Option<OfVideo<PosesArgs>>> {
     let Some(video) = video_of(&args.input)? else {
         ensure!(args.frames.is_none(), "--frames: only with a video, got photographs");
         return Ok(None);
     };
     let is_file = args.out.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
+    ensure!(
+        is_file || !args.out.is_file(),
+        "--out {}: expected a folder or a .json file, got another file",
+        args.out.display()
+    );
     let folder = if is_file {
         let stem = args.out.file_stem().unwrap_or_default().to_string_lossy();
         args.out.with_file_name(format!("{stem}_{FOLDER}"))
@@ -57,7 +81,7 @@ pub fn of_poses(args: &PosesArgs, progress: &mut Progress) -> Result<Option<Pose
     };
     let count = args.frames.map(|count| ("--frames", count));
     let input = vec![take(&video, &folder, count, progress)?];
-    Ok(Some(PosesArgs { input, ..args.clone() }))
+    Ok(Some(OfVideo { args: PosesArgs { input, ..args.clone() }, video }))
 }
 
 /// The video that `input` names: the file, or the only one of a folder without photographs.

@@ -12,7 +12,7 @@ use super::html::Page;
 use super::pair::folder_of;
 use super::video::{self, Video};
 use crate::report::{print_line, print_warning};
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -75,6 +75,31 @@ impl Scored {
     }
 }
 
+/// Refuses an output folder that a run cannot use, whatever it reads. It creates nothing.
+///
+/// # Errors
+/// No folder; a folder with the poses of a scene, which the new cameras.json would overwrite or hide.
+pub fn check(out: &Path) -> Result<()> {
+    ensure!(
+        !out.exists() || out.is_dir(),
+        "output folder {}: expected a folder, got a file",
+        out.display()
+    );
+    // A cameras.json may be that of an earlier run, which is replaced.
+    if is_scene(out) && !out.join("cameras.json").is_file() {
+        bail!(holds_poses(out));
+    }
+    Ok(())
+}
+
+fn holds_poses(out: &Path) -> String {
+    format!(
+        "output folder {}: holds the poses of a scene, which the cameras.json that is written would replace; \
+         choose another",
+        out.display()
+    )
+}
+
 /// Creates the output folder before the network runs. `input` is the path of the scene.
 ///
 /// # Errors
@@ -99,14 +124,10 @@ pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
     }
     let own = scene.source.has_file()
         && std::fs::canonicalize(folder_of(input)).is_ok_and(|folder| folder == real);
-    // A cameras.json may be that of an earlier run, which is replaced.
-    if own || (is_scene(&real) && !real.join("cameras.json").is_file()) {
-        bail!(
-            "output folder {}: holds the poses of a scene, which the cameras.json that is written \
-             would replace; choose another",
-            out.display()
-        );
+    if own {
+        bail!(holds_poses(out));
     }
+    check(out)?;
     remove_earlier(out);
     FOLDERS.iter().try_for_each(|f| make(&out.join(f)))
 }

@@ -6,7 +6,7 @@ use super::pair::{self, EstimateRequest};
 use crate::report::{Answer, Progress, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use subsplat::EstimatedScene;
 use subsplat::cameras::estimation::Confidence;
 use subsplat::files::photos::image::save_png;
@@ -20,12 +20,12 @@ use subsplat_kernels::camera::Camera;
 pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     let of_video = clip::of_poses(args, &mut progress)?;
-    let args = of_video.as_ref().unwrap_or(args);
+    let args = of_video.as_ref().map_or(args, |of_video| &of_video.args);
     let read = ReadArgs { strict: args.strict, ..Default::default() };
     let photographs = pair::photographs(&args.input, &read)?.with_context(|| {
         format!("{}: expected photographs, got a scene with cameras", args.input[0].display())
     })?;
-    check_names(&photographs)?;
+    check_names(&photographs, folder_of(&cameras_file(&args.out)))?;
     let request = EstimateRequest {
         fov: args.fov,
         intrinsics: args.intrinsics.as_deref(),
@@ -41,11 +41,22 @@ pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
     answer.finish(&report(&photographs, &estimated, &files, &progress))
 }
 
+/// The file of the cameras.
+fn cameras_file(out: &Path) -> PathBuf {
+    let is_file = out.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
+    if is_file { out.to_owned() } else { out.join("cameras.json") }
+}
+
+/// The folder of a file.
+fn folder_of(file: &Path) -> &Path {
+    file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Writes the cameras; returns the files.
 fn write(out: &Path, estimated: &EstimatedScene) -> Result<Vec<PathBuf>> {
-    let is_file = out.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
-    let file = if is_file { out.to_owned() } else { out.join("cameras.json") };
-    let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let file = cameras_file(out);
+    let is_file = file == out;
+    let folder = folder_of(&file);
     std::fs::create_dir_all(folder)
         .with_context(|| format!("output folder {}", folder.display()))?;
     let frames = &estimated.scene.frames;
@@ -92,16 +103,44 @@ fn pictures(folder: &Path, frames: &[Frame]) -> Result<Vec<PathBuf>> {
     frames.iter().map(picture).collect()
 }
 
-/// Path of a picture from a folder: relative where it lies inside, else absolute.
+/// Path of a picture from a folder, which need not exist: relative where it lies inside, else absolute; relative
+/// too where a folder outside of both has a name that is not UTF-8.
+///
+/// # Errors
+/// A path that is not UTF-8 in each way.
 fn path_from(folder: &Path, picture: &Path) -> Result<String> {
-    let real = |p: &Path| std::fs::canonicalize(p).with_context(|| p.display().to_string());
     let (folder, picture) = (real(folder)?, real(picture)?);
     let path = picture.strip_prefix(&folder).unwrap_or(&picture);
-    Ok(path.to_string_lossy().replace('\\', "/"))
+    let around = || relative(&folder, &picture);
+    let path = path.to_str().map(str::to_owned).or_else(|| Some(around().to_str()?.to_owned()));
+    let path = path.with_context(|| {
+        format!(
+            "{}: expected folders with names in UTF-8, which pose files can hold; rename them, or choose an --out \
+             beside the photographs",
+            picture.display()
+        )
+    })?;
+    Ok(path.replace('\\', "/"))
 }
 
-/// Refuses names that a pose file cannot hold, before the work.
-fn check_names(photographs: &[PathBuf]) -> Result<()> {
+/// The absolute path without links, of a path that need not exist.
+fn real(path: &Path) -> Result<PathBuf> {
+    let context = || path.display().to_string();
+    let whole = std::path::absolute(path).with_context(context)?;
+    let existing = whole.ancestors().find(|part| part.exists()).unwrap_or(&whole);
+    let rest = whole.strip_prefix(existing).unwrap_or(Path::new(""));
+    Ok(std::fs::canonicalize(existing).with_context(context)?.join(rest))
+}
+
+/// The path from a folder to a file, both absolute.
+fn relative(folder: &Path, file: &Path) -> PathBuf {
+    let shared = folder.components().zip(file.components()).take_while(|(a, b)| a == b).count();
+    let up = folder.components().skip(shared).map(|_| Component::ParentDir);
+    up.chain(file.components().skip(shared)).collect()
+}
+
+/// Refuses names that a pose file in `folder` cannot hold, before the work.
+fn check_names(photographs: &[PathBuf], folder: &Path) -> Result<()> {
     for path in photographs {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let holds = path.to_str().is_some()
@@ -114,6 +153,7 @@ fn check_names(photographs: &[PathBuf]) -> Result<()> {
              files can hold; rename the photograph",
             path.display()
         );
+        path_from(folder, path)?;
     }
     Ok(())
 }
@@ -173,4 +213,31 @@ fn report(
         "seconds": progress.seconds(),
         "peak_memory_bytes": peak_memory_bytes(),
     })
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt;
+
+    #[test]
+    fn paths_below_a_folder_whose_name_is_not_utf_8() {
+        let place = tempfile::tempdir().unwrap();
+        let latin = place.path().join(OsStr::from_bytes(b"K\xfcche"));
+        std::fs::create_dir_all(latin.join("photos")).unwrap();
+        let picture = latin.join("photos/a.jpg");
+        std::fs::write(&picture, "").unwrap();
+        assert_eq!(path_from(&latin.join("photos"), &picture).unwrap(), "a.jpg");
+        assert_eq!(path_from(&latin.join("out"), &picture).unwrap(), "../photos/a.jpg");
+        let error = path_from(&place.path().join("out"), &picture).unwrap_err().to_string();
+        assert!(error.contains("names in UTF-8"), "{error}");
+        // Elsewhere the path is absolute, without links and `..`.
+        let plain = place.path().join("plain");
+        std::fs::create_dir(&plain).unwrap();
+        std::fs::write(plain.join("a.jpg"), "").unwrap();
+        let expected = std::fs::canonicalize(plain.join("a.jpg")).unwrap();
+        let found = path_from(&place.path().join("out"), &plain.join("../plain/a.jpg")).unwrap();
+        assert_eq!(Path::new(&found), expected);
+    }
 }

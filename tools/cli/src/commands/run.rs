@@ -1,6 +1,7 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
 use super::args::{LowpassArg, PathArg, RenderingArgs, RunArgs, SceneFormatArg, SourceArgs};
+use super::clip::OfVideo;
 use super::frames::{self, DepthSpread};
 use super::html::Page;
 use super::info::print_left_out;
@@ -10,7 +11,7 @@ use super::{browser, clip, memory, model, pair, render, video};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use subsplat::files::SaveOptions;
 use subsplat::files::photos::image::{LoadOptions, Truncated};
 use subsplat::files::photos::notes::grouped;
@@ -50,8 +51,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     args.motion.video.as_deref().map_or(Ok(()), video::check)?;
     let of_video = clip::of_run(args, &mut progress)?;
-    let args = of_video.as_ref().unwrap_or(args);
-    let mut plan = plan(args, &mut progress)?;
+    let clip = of_video.as_ref();
+    let args = clip.map_or(args, |of_video| &of_video.args);
+    let mut plan = plan(args, clip.map(OfVideo::scene_name), &mut progress)?;
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);
     let model = progress.stage("model", |_| model::load(&request))?.with_backend(&backend);
@@ -130,7 +132,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     output::write_cameras(&args.out, &scored, &plan.scene, near_far)?;
     let video = video::finish(job.video.take(), &args.motion, answer)?;
     let assessment = progress.stage("inputs", |_| result.assess(&mut renderer, &options))?;
-    Done { model, result, options, scored, assessment, files, video }
+    let clip = clip.map(|of_video| of_video.video.clone());
+    Done { model, result, options, scored, assessment, files, video, clip }
         .finish(args, &plan, progress, answer)?;
     print_left_out(&plan.scene);
     Ok(())
@@ -171,9 +174,11 @@ fn backend(device: &str) -> Backend {
     })
 }
 
-/// Checks the arguments and reads the scene.
-fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
-    let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
+/// Checks the arguments and reads the scene, which gets the name `name`.
+fn plan(args: &RunArgs, name: Option<String>, progress: &mut Progress) -> Result<Plan> {
+    let mut scene =
+        progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
+    scene.name = name.unwrap_or(scene.name);
     scene.warnings.iter().for_each(print_warning);
     let (context, reason) = context(&args.source, &args.input[0], &scene)?;
     print_line(format!(
@@ -384,6 +389,8 @@ struct Done {
     assessment: Assessment,
     files: Vec<Value>,
     video: Value,
+    /// The video of which the photographs are frames.
+    clip: Option<PathBuf>,
 }
 
 impl Done {
@@ -406,6 +413,7 @@ impl Done {
         let mvsplat_rules = self.options.convention == Convention::Mvsplat;
         json!({
             "scene": plan.scene.name,
+            "input_video": self.clip.as_ref().map(|clip| clip.display().to_string()),
             "context": plan.context.iter().map(name).collect::<Vec<_>>(),
             "near": bounds.near,
             "far": bounds.far,

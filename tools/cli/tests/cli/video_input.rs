@@ -155,7 +155,7 @@ fn the_rotation_of_the_metadata_is_applied_and_a_folder_of_one_video_is_one() {
 }
 
 /// Calls the program on `clip.mp4` with programs `ffprobe` and `ffmpeg` of these shell scripts, which are in PATH
-/// alone.
+/// alone. Beside it lie `programs` and COLMAP's `model`.
 #[cfg(unix)]
 fn with_programs(ffprobe: &str, ffmpeg: &str, arguments: &[&str]) -> Called {
     use std::os::unix::fs::PermissionsExt;
@@ -170,6 +170,10 @@ fn with_programs(ffprobe: &str, ffmpeg: &str, arguments: &[&str]) -> Called {
             fs::set_permissions(&file, fs::Permissions::from_mode(0o755)).unwrap();
         }
     }
+    let model = place.path().join("model");
+    fs::create_dir(&model).unwrap();
+    fs::write(model.join("cameras.txt"), "1 PINHOLE 64 48 70 70 32 24\n").unwrap();
+    fs::write(model.join("images.txt"), "1 1 0 0 0 0 0 0 1 a.png\n\n").unwrap();
     fs::write(place.path().join("clip.mp4"), b"\0\0\0\x18ftypmp42\0\0\0\0").unwrap();
     call_with(place.path(), arguments, &[("PATH", programs.to_str().unwrap())])
 }
@@ -203,6 +207,13 @@ fn failures_of_ffmpeg_are_one_clear_error() {
             );
         }
     }
+    // An output folder that cannot be used is refused before a frame is written.
+    let called = with_programs(stream, frame, &["run", "clip.mp4", "-o", "programs/ffmpeg"]);
+    assert!(called.code == 1 && called.error().contains("got a file"), "{}", called.stderr);
+    let called = with_programs(stream, frame, &["poses", "clip.mp4", "-o", "programs/ffmpeg"]);
+    assert!(called.code == 1 && called.error().contains("another file"), "{}", called.stderr);
+    let called = with_programs(stream, frame, &["run", "clip.mp4", "-o", "model"]);
+    assert!(called.code == 1 && called.error().contains("holds the poses"), "{}", called.stderr);
     // Flags and inputs that do not fit a video.
     for (arguments, words) in [
         (&["run", "clip.mp4", "--frames", "1"][..], "2 to 100"),

@@ -8,6 +8,26 @@ use subsplat::files::poses::matrices::PoseConvention;
 use subsplat::files::poses::reading::SceneOptions;
 use subsplat::reconstruct::Projection;
 
+/// Help of `--fov`: in short and whole.
+pub(super) const FOV_HELP: [&str; 2] = [
+    "Angle of view across, degrees; replaces EXIF's",
+    "Angle of view across, degrees; replaces EXIF's.\n\n\
+     It holds for all photographs. Without it, the focal length comes from EXIF, else it is estimated. The \
+     estimate from two photographs alone is often wrong.",
+];
+/// Help of `--intrinsics`.
+pub(super) const INTRINSICS_HELP: &str =
+    "Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers";
+/// Help of `--lens`: in short and whole.
+pub(super) const LENS_HELP: [&str; 2] = [
+    "Lens of the photographs: pinhole, panorama, or `fisheye[:DEG][:CURVE]`",
+    "Lens of the photographs: pinhole, panorama, or `fisheye[:DEG][:CURVE]`.\n\n\
+     By default a picture is a panorama where the file says so, or where it is twice as wide as high and its \
+     left and right edges continue each other; else a photograph. Six views of 90 degrees are made of a \
+     panorama, one of at most 90 degrees of a fisheye picture. DEG: angle across the circle (180). CURVE: \
+     equidistant (the default), equisolid or stereographic.",
+];
+
 /// Parts of a scene with cameras that are read.
 #[derive(Clone, Debug, Default, Args)]
 pub struct ReadArgs {
@@ -46,12 +66,11 @@ impl ReadArgs {
 /// the first camera is the world unless --pose-a is given.
 #[derive(Clone, Debug, Args)]
 pub struct PairArgs {
-    /// Angle of view across, degrees; replaces EXIF's.
-    ///
-    /// It holds for all photographs. Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
-    /// photographs alone is often wrong.
+    /// See [`FOV_HELP`].
     #[arg(
         long,
+        help = FOV_HELP[0],
+        long_help = FOV_HELP[1],
         value_name = "DEG",
         conflicts_with = "intrinsics",
         allow_negative_numbers = true,
@@ -59,15 +78,25 @@ pub struct PairArgs {
         help_heading = CAMERAS
     )]
     pub fov: Option<f32>,
-    /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
-    #[arg(long, value_name = "K", hide_short_help = true, help_heading = CAMERAS)]
+    /// See [`INTRINSICS_HELP`].
+    #[arg(
+        long,
+        help = INTRINSICS_HELP,
+        value_name = "K",
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
     pub intrinsics: Option<String>,
-    /// Lens of the photographs: pinhole, panorama, or `fisheye[:DEG][:CURVE]`.
-    ///
-    /// By default a picture is a panorama where the file says so, or where it is twice as wide as high and its left and right
-    /// edges continue each other; else a photograph. Six views of 90 degrees are made of a panorama, one of at most 90 degrees
-    /// of a fisheye picture. DEG: angle across the circle (180). CURVE: equidistant (the default), equisolid or stereographic.
-    #[arg(long, value_name = "LENS", value_parser = values::projection, hide_short_help = true, help_heading = CAMERAS)]
+    /// See [`LENS_HELP`].
+    #[arg(
+        long,
+        help = LENS_HELP[0],
+        long_help = LENS_HELP[1],
+        value_name = "LENS",
+        value_parser = values::projection,
+        hide_short_help = true,
+        help_heading = CAMERAS
+    )]
     pub lens: Option<Projection>,
     /// Position of the second of two cameras as seen from the first: right, down, forward.
     ///

@@ -1,5 +1,6 @@
 //! Arguments of `poses`.
 
+use super::cameras::{FOV_HELP, INTRINSICS_HELP, LENS_HELP};
 use crate::commands::values;
 use clap::Args;
 use std::path::PathBuf;
@@ -24,21 +25,27 @@ pub struct PosesArgs {
     /// 10 to 60 do best. Default: as many as the camera's motion needs, 12 to 36.
     #[arg(long, value_name = "N", value_parser = values::taken)]
     pub frames: Option<usize>,
-    /// Angle of view across, degrees; replaces EXIF's.
-    ///
-    /// It holds for all photographs. Without it, the focal length comes from EXIF, else it is estimated. The estimate from two
-    /// photographs alone is often wrong.
-    #[arg(long, value_name = "DEG", conflicts_with = "intrinsics", value_parser = values::fov)]
+    /// See [`FOV_HELP`].
+    #[arg(
+        long,
+        help = FOV_HELP[0],
+        long_help = FOV_HELP[1],
+        value_name = "DEG",
+        conflicts_with = "intrinsics",
+        value_parser = values::fov
+    )]
     pub fov: Option<f32>,
-    /// Focal lengths and centre, pixels: FX,FY,CX,CY or 3x3 numbers.
-    #[arg(long, value_name = "K")]
+    /// See [`INTRINSICS_HELP`].
+    #[arg(long, help = INTRINSICS_HELP, value_name = "K")]
     pub intrinsics: Option<String>,
-    /// Lens of the photographs: pinhole, panorama, or `fisheye[:DEG][:CURVE]`.
-    ///
-    /// By default a picture is a panorama where the file says so, or where it is twice as wide as high and its left and right
-    /// edges continue each other; else a photograph. Six views of 90 degrees are made of a panorama, one of at most 90 degrees
-    /// of a fisheye picture. DEG: angle across the circle (180). CURVE: equidistant (the default), equisolid or stereographic.
-    #[arg(long, value_name = "LENS", value_parser = values::projection)]
+    /// See [`LENS_HELP`].
+    #[arg(
+        long,
+        help = LENS_HELP[0],
+        long_help = LENS_HELP[1],
+        value_name = "LENS",
+        value_parser = values::projection
+    )]
     pub lens: Option<Projection>,
     /// Accept doubtful cameras and truncated JPEG files.
     #[arg(long)]
