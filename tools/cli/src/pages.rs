@@ -144,9 +144,15 @@ mod exhausted {
     #[cold]
     fn end(size: usize) -> ! {
         use std::ffi::{c_int, c_void};
+        use std::sync::atomic::{AtomicBool, Ordering};
         unsafe extern "C" {
             fn write(file: c_int, from: *const c_void, length: usize) -> isize;
             fn _exit(code: c_int) -> !;
+        }
+        /// Set by the first thread without memory; the others wait for the end.
+        static ENDS: AtomicBool = AtomicBool::new(false);
+        while ENDS.swap(true, Ordering::Relaxed) {
+            std::thread::yield_now();
         }
         let mut buffer = [0; 256];
         let line = line(size, &mut buffer);
