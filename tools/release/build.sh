@@ -3,7 +3,8 @@
 #
 # Without a target: x86_64-unknown-linux-musl. A target may end in a version of glibc
 # (x86_64-unknown-linux-gnu.2.31). Zig compiles and links (cargo-zigbuild); both come from PyPI into out/release-tools.
-# FEATURES adds features of tools/cli (`FEATURES=mp4,heic`), PAGE=no leaves the page out, CARGO_ARGS goes to cargo.
+# FEATURES adds features of tools/cli (`FEATURES=mp4,heic`), CARGO_ARGS goes to cargo. PAGE=no leaves the page out,
+# PAGE=FOLDER takes one that tools/web/build.sh has built.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 place=$PWD/out/release tools=$PWD/out/release-tools
@@ -25,10 +26,14 @@ if ! command -v cargo-about >/dev/null; then
 fi
 
 mkdir -p "$place"
-say "licences of the dependencies …"
-cargo about generate --locked --fail -c tools/release/about.toml -m tools/cli/Cargo.toml \
-    -o "$place/LICENSES-of-dependencies.txt" tools/release/about.hbs
-[[ ${PAGE:-yes} == no ]] || tools/web/build.sh "$place/page"
+licences=$place/LICENSES-of-dependencies.txt
+if [[ ! $licences -nt Cargo.lock || ! $licences -nt tools/release/about.hbs ]]; then
+    say "licences of the dependencies (some minutes) …"
+    cargo about generate --locked --fail -c tools/release/about.toml -m tools/cli/Cargo.toml \
+        -o "$licences" tools/release/about.hbs
+fi
+page=${PAGE:-$place/page}
+[[ -n ${PAGE:-} ]] || tools/web/build.sh "$page"
 
 # Programs and manual in a folder of the target's own.
 compile() {
@@ -55,10 +60,10 @@ pack() {
     folder=$place/$name
     rm -rf "$folder" && mkdir -p "$folder/examples"
     cp "$built/subsplat$ending" "$built/subsplat-convert$ending" README.md LICENSE "$folder"
-    cp "$place/LICENSES-of-dependencies.txt" "$folder"
+    cp "$licences" "$folder"
     cp -r examples/berlin "$folder/examples"
     [[ ! -d $place/manual ]] || cp -r "$place/manual/." "$folder"
-    [[ ${PAGE:-yes} == no ]] || cp -r "$place/page" "$folder"
+    [[ $page == no ]] || cp -r "$page" "$folder/page"
     if [[ $ending == .exe ]]; then
         (cd "$place" && python3 -m zipfile -c "$name.zip" "$name")
     else

@@ -1,7 +1,9 @@
 //! H.264 in an .mp4 file, by OpenH264 (BSD-2-Clause, compiled from its C++ source) and the container of `muxide`.
 //!
 //! The feature `mp4` turns this module on: a first build then needs a C++ compiler. Without it `--video` gives the
-//! frames to ffmpeg. Baseline profile: every phone and browser plays it.
+//! frames to ffmpeg. Baseline profile: every phone and browser plays it. Berlin's clip (150 frames of 512x384, limit
+//! 2.4 Mbit/s) has 1.8 MB and 35.5 dB against its frames. OpenH264 encodes up to 3840x2160. It prints a warning to
+//! stderr when it starts, because no frame may be skipped; its setting for messages takes effect only afterwards.
 
 use anyhow::{Context, Result};
 use muxide::api::{Muxer, MuxerBuilder, VideoCodec};
