@@ -181,7 +181,8 @@ fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
     ensure!(
         found.photographs.len() >= 2,
         "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a RealEstate10K txt, poses.txt \
-         with K.txt, or cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape or RealityCapture) or a folder of at least 2 photographs, got {} photograph(s) and no cameras",
+         with K.txt, or cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape or RealityCapture) or a \
+         folder of at least 2 photographs, got {} photograph(s) and no cameras",
         folder.display(),
         found.photographs.len()
     );
