@@ -152,11 +152,11 @@ fn cameras(path: &Path, bytes: &[u8]) -> Result<MetashapeCameras> {
     Ok(largest)
 }
 
+/// Name of a component, and a camera of it with its number.
+type Entry<'a> = (Option<&'a str>, (usize, MetashapeCamera));
+
 /// The entries of a chunk, numbered, each with its component.
-fn entries<'a>(
-    path: &Path,
-    chunk: Node<'a, '_>,
-) -> Result<Vec<(Option<&'a str>, (usize, MetashapeCamera))>> {
+fn entries<'a>(path: &Path, chunk: Node<'a, '_>) -> Result<Vec<Entry<'a>>> {
     let sensors: HashMap<&str, Result<MetashapeSensor>> = children(chunk, "sensors", "sensor")
         .filter_map(|node| Some((node.attribute("id")?, sensor(path, node))))
         .collect();
