@@ -143,14 +143,13 @@ mod tests {
                 LoadedFrame { picture: picture.clone(), mask: None, camera, view_of, warnings };
             Photo::from_loaded(frame)
         };
-        let codes = |of: [Option<&str>; 2]| -> Vec<String> {
-            let reports = check_pairs(&of.map(photo), |_| Ok(())).unwrap();
-            reports[0].findings.iter().map(|finding| finding.code.clone()).collect()
-        };
-        // Two photographs from one place, and views of two pictures there.
-        assert!(codes([None, None]).contains(&"poses_wrong".to_owned()));
-        assert_eq!(codes([Some("a.jpg"), Some("b.jpg")]), ["poses_wrong"]);
-        assert!(codes([Some("a.jpg"), Some("a.jpg")]).is_empty());
+        let report =
+            |of: [Option<&str>; 2]| check_pairs(&of.map(photo), |_| Ok(())).unwrap().swap_remove(0);
+        let of_one = report([Some("a.jpg"), Some("a.jpg")]);
+        assert!(of_one.findings.is_empty() && of_one.fov_deg == [[0.0; 2]; 2]);
+        let of_two = report([Some("a.jpg"), Some("b.jpg")]);
+        assert!(of_two.findings.iter().all(|f| OF_CAMERAS.contains(&f.code.as_str())));
+        assert!(of_two.fov_deg[0][0] > 60.0 && report([None, None]).fov_deg[0][0] > 60.0);
     }
 
     #[test]
