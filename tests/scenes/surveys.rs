@@ -183,8 +183,8 @@ fn sensors_of_metashape() {
 fn panoramas_of_metashape_are_cut() {
     let (folder, cameras) = plain(2);
     let room = DMat3::IDENTITY;
-    for i in 0..2 {
-        let at = axes(&cameras[i].camera)[3] * 0.1;
+    for (i, of) in cameras.iter().enumerate() {
+        let at = axes(&of.camera)[3] * 0.1;
         let file = folder.path().join(format!("images/00{i}.png"));
         save_png(file, &panorama(128, at, room)).unwrap();
     }

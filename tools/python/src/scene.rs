@@ -243,8 +243,17 @@ impl Scene {
 
     fn save_page(&self, path: &Path, options: &SaveOptions, most: Option<usize>) -> PyResult<()> {
         let title = path.file_stem().unwrap_or_default().to_string_lossy();
-        let (splats, cameras) = (&self.splats, &self.cameras);
-        let page = Page { splats, cameras, options: &self.options, title: &title };
+        let named =
+            |(i, camera): (usize, &subsplat::Camera)| (format!("photograph {}", i + 1), *camera);
+        let cameras: Vec<_> = self.cameras.iter().enumerate().map(named).collect();
+        let page = Page {
+            splats: &self.splats,
+            cameras: &cameras,
+            // A scene with a verdict was made here, from photographs at these cameras.
+            photographs: self.verdict.is_some(),
+            options: &self.options,
+            title: &title,
+        };
         let written = match most {
             Some(most) => page.write_within(path, options, most, &mut Renderer::new(&Backend::Cpu)),
             None => page.write(path, options),
