@@ -54,3 +54,14 @@ pub fn called(command: &mut Command) -> Called {
         stderr: text(output.stderr),
     }
 }
+
+/// The bytes of a .ply file without the lines of its header that name the photographs, which a caller of the library
+/// does not name.
+pub fn without_photographs(file: &Path) -> Vec<u8> {
+    const END: &[u8] = b"end_header\n";
+    let bytes = std::fs::read(file).unwrap();
+    let Some(at) = bytes.windows(END.len()).position(|w| w == END) else { return bytes };
+    let header = std::str::from_utf8(&bytes[..at]).unwrap();
+    let kept = header.split_inclusive('\n').filter(|l| !l.contains("subsplat photograph:"));
+    [kept.collect::<String>().as_bytes(), &bytes[at..]].concat()
+}
