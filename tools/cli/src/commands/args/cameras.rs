@@ -66,7 +66,7 @@ impl ReadArgs {
 /// the first camera is the world unless --pose-a is given.
 #[derive(Clone, Debug, Args)]
 pub struct PairArgs {
-    /// See [`FOV_HELP`].
+    /// See `FOV_HELP`.
     #[arg(
         long,
         help = FOV_HELP[0],
@@ -78,7 +78,7 @@ pub struct PairArgs {
         help_heading = CAMERAS
     )]
     pub fov: Option<f32>,
-    /// See [`INTRINSICS_HELP`].
+    /// See `INTRINSICS_HELP`.
     #[arg(
         long,
         help = INTRINSICS_HELP,
@@ -87,7 +87,7 @@ pub struct PairArgs {
         help_heading = CAMERAS
     )]
     pub intrinsics: Option<String>,
-    /// See [`LENS_HELP`].
+    /// See `LENS_HELP`.
     #[arg(
         long,
         help = LENS_HELP[0],

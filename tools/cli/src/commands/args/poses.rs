@@ -25,7 +25,7 @@ pub struct PosesArgs {
     /// 10 to 60 do best. Default: as many as the camera's motion needs, 12 to 36.
     #[arg(long, value_name = "N", value_parser = values::taken)]
     pub frames: Option<usize>,
-    /// See [`FOV_HELP`].
+    /// See `FOV_HELP`.
     #[arg(
         long,
         help = FOV_HELP[0],
@@ -35,10 +35,10 @@ pub struct PosesArgs {
         value_parser = values::fov
     )]
     pub fov: Option<f32>,
-    /// See [`INTRINSICS_HELP`].
+    /// See `INTRINSICS_HELP`.
     #[arg(long, help = INTRINSICS_HELP, value_name = "K")]
     pub intrinsics: Option<String>,
-    /// See [`LENS_HELP`].
+    /// See `LENS_HELP`.
     #[arg(
         long,
         help = LENS_HELP[0],
