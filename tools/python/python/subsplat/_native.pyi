@@ -2,46 +2,61 @@
 
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, Optional
+from typing import Any, Optional, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 __version__: str
+__all__ = [
+    "Camera",
+    "Frame",
+    "Scene",
+    "__version__",
+    "check",
+    "estimate_cameras",
+    "load",
+    "photographs",
+    "rasterize",
+    "reconstruct",
+]
 
-Floats = NDArray[np.float32]
-Progress = Optional[Callable[[str, float], Any]]
+_Floats = NDArray[np.float32]
+_Progress = Optional[Callable[[str, float], Any]]
 
+@final
 class Camera:
     """A pinhole camera without lens distortion.
 
     viewmat: [4, 4] float32, world to camera (rigid). K: [3, 3] float32, px. width, height: px.
     """
 
-    def __init__(self, viewmat: Floats, K: Floats, width: int, height: int) -> None: ...
+    def __new__(cls, viewmat: _Floats, K: _Floats, width: int, height: int) -> Camera: ...
     @property
-    def viewmat(self) -> Floats: ...
+    def viewmat(self) -> _Floats: ...
     @property
-    def K(self) -> Floats: ...
+    def K(self) -> _Floats: ...
     @property
     def width(self) -> int: ...
     @property
     def height(self) -> int: ...
     def resized(self, width: int, height: int) -> Camera: ...
 
+@final
 class Frame:
     def backward(
         self,
-        v_colors: Optional[Floats],
-        v_alphas: Optional[Floats],
-        v_depth_sums: Optional[Floats],
+        v_colors: Optional[_Floats],
+        v_alphas: Optional[_Floats],
+        v_depth_sums: Optional[_Floats],
         viewmats: bool,
-    ) -> dict[str, Floats]: ...
+    ) -> dict[str, _Floats]: ...
 
+@final
 class Scene:
-    def __init__(
-        self, means: Floats, quats: Floats, scales: Floats, opacities: Floats, sh: Floats
-    ) -> None: ...
+    def __new__(
+        cls, means: _Floats, quats: _Floats, scales: _Floats, opacities: _Floats, sh: _Floats
+    ) -> Scene: ...
     def __len__(self) -> int: ...
     @property
     def cameras(self) -> list[Camera]: ...
@@ -50,10 +65,10 @@ class Scene:
     @property
     def warnings(self) -> list[str]: ...
     def overview(self, side: int) -> Camera: ...
-    def splats(self) -> dict[str, Floats]: ...
+    def splats(self) -> dict[str, _Floats]: ...
     def render(
         self, camera: Camera, background: Optional[Sequence[float]]
-    ) -> tuple[Floats, Floats, Floats]: ...
+    ) -> tuple[_Floats, _Floats, _Floats]: ...
     def save(
         self,
         path: str | PathLike[str],
@@ -64,25 +79,25 @@ class Scene:
     ) -> None: ...
 
 def rasterize(
-    means: Floats,
-    quats: Floats,
-    scales: Floats,
-    opacities: Floats,
-    colors: Floats,
-    viewmats: Floats,
-    Ks: Floats,
+    means: _Floats,
+    quats: _Floats,
+    scales: _Floats,
+    opacities: _Floats,
+    colors: _Floats,
+    viewmats: _Floats,
+    Ks: _Floats,
     width: int,
     height: int,
     near_plane: float,
     eps2d: float,
     sh_degree: Optional[int],
     antialiased: bool,
-    backgrounds: Optional[Floats],
+    backgrounds: Optional[_Floats],
     keep: bool,
-) -> tuple[Floats, Floats, Floats, Optional[Frame]]: ...
+) -> tuple[_Floats, _Floats, _Floats, Optional[Frame]]: ...
 def load(path: str | PathLike[str]) -> Scene: ...
 def photographs(
-    path: str | PathLike[str], progress: Progress
+    path: str | PathLike[str], progress: _Progress
 ) -> list[tuple[str, NDArray[np.uint8], Camera]]: ...
 def reconstruct(
     photos: str | list[Any],
@@ -93,11 +108,11 @@ def reconstruct(
     upscale: int,
     adjust_poses: bool,
     weights: Optional[str | PathLike[str]],
-    progress: Progress,
+    progress: _Progress,
 ) -> Scene: ...
 def estimate_cameras(
-    photos: str | list[Any], progress: Progress
-) -> tuple[list[Optional[Camera]], Floats, bool, list[str]]: ...
+    photos: str | list[Any], progress: _Progress
+) -> tuple[list[Optional[Camera]], _Floats, bool, list[str]]: ...
 def check(
-    photos: str | list[Any], cameras: Optional[list[Camera]], progress: Progress
+    photos: str | list[Any], cameras: Optional[list[Camera]], progress: _Progress
 ) -> str: ...
