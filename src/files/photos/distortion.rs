@@ -166,7 +166,7 @@ impl Distortion {
             Self::Fisheye { k } => {
                 let uv = theta()?;
                 let t2 = uv.length_squared();
-                Some(uv * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))))
+                Some(uv * even_polynomial(k, t2))
             }
             Self::ThinPrismFisheye { .. } | Self::RadTanThinPrismFisheye { .. } => {
                 Some(self.bent(theta()?))
@@ -181,8 +181,7 @@ impl Distortion {
         let t2 = uv.length_squared();
         match *self {
             Self::ThinPrismFisheye { k, p, s } => {
-                let radial = 1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])));
-                uv * radial + tangential(uv, p) + DVec2::from(s) * t2
+                uv * even_polynomial(k, t2) + tangential(uv, p) + DVec2::from(s) * t2
             }
             Self::RadTanThinPrismFisheye { k, p, s } => {
                 let radial = k.iter().rev().fold(0.0, |sum, k| (sum + k) * t2);
@@ -204,7 +203,7 @@ impl Distortion {
                 let bottom = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]));
                 top / bottom
             }
-            Self::Polynomial { k, .. } => 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3]))),
+            Self::Polynomial { k, .. } => even_polynomial(k, r2),
             Self::Fisheye { k } => {
                 let r = r2.sqrt();
                 if r < 1e-9 {
@@ -212,7 +211,7 @@ impl Distortion {
                 }
                 let theta = r.atan();
                 let t2 = theta * theta;
-                theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))) / r
+                theta * even_polynomial(k, t2) / r
             }
             Self::ThinPrismFisheye { k, .. } => Self::Fisheye { k }.radial(r2),
             Self::RadTanThinPrismFisheye { k, .. } => {
@@ -256,6 +255,11 @@ impl Distortion {
         }
         limit
     }
+}
+
+/// 1 + k1 t² + k2 t⁴ + k3 t⁶ + k4 t⁸, of `t2` = t².
+fn even_polynomial(k: [f64; 4], t2: f64) -> f64 {
+    1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))
 }
 
 /// Tangential distortion of OpenCV at a point.

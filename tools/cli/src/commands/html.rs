@@ -38,7 +38,7 @@ pub struct Page<'a> {
     pub splats: &'a Splats,
     /// Names and places that the viewer offers, its first one first; without any it shows the whole scene.
     pub cameras: &'a [(String, Camera)],
-    /// Whether the cameras are those of the photographs that the scene was made from.
+    /// True if the cameras are those of the photographs that the scene was made from.
     pub photographs: bool,
     /// Near plane, low-pass and background of the viewer.
     pub options: &'a RasterOptions,

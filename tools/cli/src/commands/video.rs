@@ -64,7 +64,7 @@ enum Encoder {
 }
 
 impl Kind {
-    /// Whether ffmpeg encodes this kind.
+    /// Returns true if ffmpeg encodes this kind.
     fn is_of_ffmpeg(self) -> bool {
         match self {
             Self::Gif | Self::Webp => false,

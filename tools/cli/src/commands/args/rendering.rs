@@ -108,7 +108,7 @@ pub struct MotionArgs {
 }
 
 impl MotionArgs {
-    /// Whether these arguments ask for an animation of the default length, which ends where it begins.
+    /// Returns true if these arguments ask for an animation of the default length, which ends where it begins.
     pub fn is_clip(&self) -> bool {
         self.video.is_some() && self.frames.is_none()
     }
