@@ -302,6 +302,7 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     let planes = &planes(&seeds);
     let mut kept: [(Frames, Vec<f32>); 2] = Default::default();
     let (mut one, mut all) = (Frames::default(), Frames::default());
+    let (mut drawn_one, mut drawn_all) = (Frames::default(), Frames::default());
     let mut contenders = vec![
         Contender::new("conventional, backward alone", Threads::One, || {
             backward(recomputes);
@@ -331,6 +332,18 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
             let slices = slices(&case.splats);
             let (camera, options) = (&case.camera, &case.options);
             frames.rasterizer.backward(&slices, camera, options, planes, &mut frames.gradients);
+            Ok(())
+        }));
+    }
+    // What a call of `subsplat.torch.rasterization` with its backward pass does.
+    for (threads, frames) in [(Threads::One, &mut drawn_one), (Threads::All, &mut drawn_all)] {
+        let mut picture = Rendered::default();
+        contenders.push(Contender::new("subsplat, picture, then gradients", threads, move || {
+            let slices = slices(&case.splats);
+            let (camera, options) = (&case.camera, &case.options);
+            let Frames { rasterizer, gradients } = &mut *frames;
+            rasterizer.render_into(&slices, camera, options, &mut picture);
+            rasterizer.backward_of_last(&slices, camera, options, planes, gradients);
             Ok(())
         }));
     }

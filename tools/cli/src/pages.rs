@@ -7,8 +7,9 @@
 //! list, where adjacent blocks are merged. A request takes the front of the shortest free block
 //! that is long enough. After the first call of the network, few requests reach the kernel.
 //!
-//! The free list never makes the process larger than its largest set of live blocks: a request
-//! without a fitting free block first returns as many bytes to the kernel as it needs.
+//! The free list never makes the process larger than its largest set of live blocks and what
+//! [`keep_free`] allows: a request without a fitting free block first returns as many bytes to the kernel as
+//! it needs.
 //!
 //! A program declares the allocator; a library must not:
 //! ```ignore
@@ -41,6 +42,14 @@ pub fn trim() {
         // SAFETY: the function of glibc has no precondition, and is safe on any thread.
         unsafe { malloc_trim(0) };
     }
+}
+
+/// Lets `bytes` bytes of free blocks stay while a request that fits none of them gets new memory. Default: 0.
+///
+/// A loop that frees some of its blocks late takes a short block from the front of a long free one, and finds
+/// no place for the next long one: it would return and map the same memory in each round.
+pub fn keep_free(bytes: usize) {
+    large::keep_free(bytes);
 }
 
 /// Size of a huge page on x86-64 and on most AArch64 kernels, bytes. Smaller blocks go to the
@@ -174,12 +183,15 @@ mod large {
     pub(super) fn free(_: *mut u8, _: usize) {}
 
     pub(super) fn clear() {}
+
+    pub(super) fn keep_free(_: usize) {}
 }
 
 #[cfg(all(target_os = "linux", any(target_arch = "x86_64", target_arch = "aarch64")))]
 mod large {
     use super::HUGE;
     use std::ffi::{c_int, c_void};
+    use std::sync::atomic::{AtomicUsize, Ordering};
     use std::sync::{Mutex, MutexGuard, PoisonError};
 
     // Linux's PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS and MADV_HUGEPAGE.
@@ -227,7 +239,18 @@ mod large {
         stamp: 0,
     });
 
+    /// Bytes of free blocks that a request may leave ([`super::keep_free`]).
+    static KEPT: AtomicUsize = AtomicUsize::new(0);
+
+    pub(super) fn keep_free(bytes: usize) {
+        KEPT.store(bytes, Ordering::Relaxed);
+    }
+
     impl FreeList {
+        fn bytes(&self) -> usize {
+            self.blocks[..self.n].iter().map(|block| block.length).sum()
+        }
+
         fn remove(&mut self, i: usize) -> Block {
             let block = self.blocks[i];
             self.blocks.copy_within(i + 1..self.n, i);
@@ -305,7 +328,7 @@ mod large {
         if let Some(at) = free_list().take(length) {
             return (at as *mut u8, true);
         }
-        let mut left = length;
+        let mut left = length.min(free_list().bytes().saturating_sub(KEPT.load(Ordering::Relaxed)));
         while left > 0 {
             let Some(block) = free_list().take_oldest(left) else { break };
             left -= block.length;
@@ -428,6 +451,37 @@ mod tests {
                     assert!(!is_large(&layout(1)) || parts == [long, long.add(2 * HUGE)]);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_loop_that_frees_late_gets_no_new_memory() {
+        let _alone = alone();
+        let layout = |huge: usize| Layout::from_size_align(huge * HUGE, 8).unwrap();
+        // The short block of a round is freed after that of the next one is allocated.
+        let new_blocks = || {
+            let (mut short, mut new) = (filled(layout(1), 1), 0);
+            for round in 0..10 {
+                // SAFETY: each block is freed with the layout of its allocation.
+                unsafe {
+                    let next = filled(layout(1), 1);
+                    Pages.dealloc(short, layout(1));
+                    short = next;
+                    let (long, used) = large::allocate(8 * HUGE);
+                    new += usize::from(!used && round > 3);
+                    large::free(long, 8 * HUGE);
+                }
+            }
+            // SAFETY: as above.
+            unsafe { Pages.dealloc(short, layout(1)) };
+            new
+        };
+        if is_large(&layout(1)) {
+            keep_free(16 * HUGE);
+            assert_eq!(new_blocks(), 0);
+            keep_free(0);
+            large::clear();
+            assert_eq!(new_blocks(), 6, "without free memory that may stay");
         }
     }
 

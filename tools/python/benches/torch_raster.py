@@ -2,7 +2,7 @@
 
     cargo bench --bench raster -- 131k-512 --write out/raster
     python tools/python/benches/torch_raster.py out/raster/131k-512.safetensors
-    cargo bench --bench raster -- backward 131k-512 own      # "subsplat, both passes", all threads
+    cargo bench --bench raster -- backward 131k-512 own      # "subsplat, picture, then gradients", all threads
 
 The gradients are those of the bench: all inputs but the camera, with respect to colours and alpha.
 """

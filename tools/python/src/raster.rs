@@ -23,23 +23,30 @@ use subsplat::{Camera, RasterOptions};
 pub(crate) const SIDES: RangeInclusive<usize> = 1..=32_768;
 /// Most pixels of all pictures of a call: 2 GB of outputs.
 const PIXELS_MAX: usize = 100_000_000;
-/// Idle rasterizers that are kept, about 200 bytes a Gaussian each.
+/// Idle drawers that are kept, about 200 bytes a Gaussian and 20 a pixel each.
 const IDLE_MAX: usize = 2;
 /// Pixels that one thread converts in turn.
 const PART: usize = 4096;
 
-static IDLE: Mutex<Vec<Rasterizer>> = Mutex::new(Vec::new());
+/// A rasterizer and the upstream planes `[5, H, W]` of its backward pass.
+#[derive(Default)]
+struct Drawer {
+    rasterizer: Rasterizer,
+    planes: Vec<f32>,
+}
 
-/// A rasterizer, with the buffers of an earlier call where one is idle.
-fn take() -> Rasterizer {
+static IDLE: Mutex<Vec<Drawer>> = Mutex::new(Vec::new());
+
+/// A drawer, with the buffers of an earlier call where one is idle.
+fn take() -> Drawer {
     IDLE.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default()
 }
 
-fn give_back(rasterizers: impl IntoIterator<Item = Rasterizer>) {
+fn give_back(drawers: impl IntoIterator<Item = Drawer>) {
     let mut idle = IDLE.lock().unwrap_or_else(PoisonError::into_inner);
-    for rasterizer in rasterizers {
+    for drawer in drawers {
         if idle.len() < IDLE_MAX {
-            idle.push(rasterizer);
+            idle.push(drawer);
         }
     }
 }
@@ -276,7 +283,7 @@ pub(crate) fn rasterize<'py>(
     let options = options(colours, sh_degree, kind, backgrounds.as_ref(), count)?;
     let slices = arrays.slices(colours)?;
     let drawn = py.detach(|| draw(&slices, &cameras, &options, keep));
-    let (pictures, rasterizers) = drawn.map_err(PyValueError::new_err)?;
+    let (pictures, drawers) = drawn.map_err(PyValueError::new_err)?;
     let Pictures { colours: rgb, alphas, depth_sums } = pictures;
     let frame = keep.then(|| Frame {
         arrays: [
@@ -289,7 +296,7 @@ pub(crate) fn rasterize<'py>(
         colours,
         cameras,
         options,
-        rasterizers: Mutex::new(rasterizers),
+        drawers: Mutex::new(drawers),
     });
     Ok((
         array(py, rgb, &[count, height, width, 3])?,
@@ -299,19 +306,19 @@ pub(crate) fn rasterize<'py>(
     ))
 }
 
-/// Draws all cameras; keeps their rasterizers where `keep` says so.
+/// Draws all cameras; keeps their drawers where `keep` says so.
 fn draw(
     slices: &Slices<'_>,
     cameras: &[Camera],
     options: &[RasterOptions],
     keep: bool,
-) -> Result<(Pictures, Vec<Rasterizer>), String> {
+) -> Result<(Pictures, Vec<Drawer>), String> {
     slices.check_numbers()?;
     let (mut pictures, mut kept) = (Pictures::default(), Vec::new());
     let mut current = None;
     for (c, (camera, options)) in cameras.iter().zip(options).enumerate() {
-        let rasterizer = current.get_or_insert_with(take);
-        pictures.push(rasterizer.render(&slices.of_camera(c), camera, options));
+        let drawer = current.get_or_insert_with(take);
+        pictures.push(drawer.rasterizer.render(&slices.of_camera(c), camera, options));
         if keep {
             kept.extend(current.take());
         }
@@ -328,13 +335,13 @@ pub(crate) struct Frame {
     cameras: Vec<Camera>,
     options: Vec<RasterOptions>,
     /// One for each camera.
-    rasterizers: Mutex<Vec<Rasterizer>>,
+    drawers: Mutex<Vec<Drawer>>,
 }
 
 impl Drop for Frame {
     fn drop(&mut self) {
-        let rasterizers = self.rasterizers.get_mut().unwrap_or_else(PoisonError::into_inner);
-        give_back(rasterizers.drain(..));
+        let drawers = self.drawers.get_mut().unwrap_or_else(PoisonError::into_inner);
+        give_back(drawers.drain(..));
     }
 }
 
@@ -441,14 +448,15 @@ impl Frame {
         ] {
             finite(name, values.unwrap_or_default(), row)?;
         }
-        let mut rasterizers = self.rasterizers.lock().unwrap_or_else(PoisonError::into_inner);
-        let (mut sums, mut planes) = (Sums::default(), vec![0.0; 5 * pixels]);
-        let views = self.cameras.iter().zip(&self.options).zip(rasterizers.iter_mut());
-        for (c, ((camera, options), rasterizer)) in views.enumerate() {
-            fill_planes(&mut planes, upstream, c, pixels);
+        let mut drawers = self.drawers.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut sums = Sums::default();
+        let views = self.cameras.iter().zip(&self.options).zip(drawers.iter_mut());
+        for (c, ((camera, options), Drawer { rasterizer, planes })) in views.enumerate() {
+            planes.resize(5 * pixels, 0.0);
+            fill_planes(planes, upstream, c, pixels);
             let splats = slices.of_camera(c);
             let mut own = Gradients::default();
-            rasterizer.backward_of_last(&splats, camera, options, &planes, &mut own);
+            rasterizer.backward_of_last(&splats, camera, options, planes, &mut own);
             sums.backgrounds.extend(own.background);
             if viewmats {
                 sums.viewmats.extend(viewmat_gradient(&splats, camera, options, &own));
@@ -493,11 +501,14 @@ fn fill_planes(planes: &mut [f32], upstream: Upstream<'_>, c: usize, pixels: usi
                 }
             });
         }
+    } else {
+        rgb.fill(0.0);
     }
     let single = [upstream.alphas, upstream.depth_sums];
     for (plane, values) in rest.chunks_exact_mut(pixels).zip(single) {
-        if let Some(values) = values {
-            plane.copy_from_slice(&values[c * pixels..(c + 1) * pixels]);
+        match values {
+            Some(values) => plane.copy_from_slice(&values[c * pixels..(c + 1) * pixels]),
+            None => plane.fill(0.0),
         }
     }
 }

@@ -86,6 +86,24 @@ def test_only_what_is_asked_for_has_gradients():
         assert not rasterization(**inputs, **rest)[0].requires_grad
 
 
+def test_a_backward_pass_sees_nothing_of_the_one_before():
+    """Upstream gradients that one call has and the next lacks: buffers are reused between calls."""
+
+    def gradient(*losses):
+        inputs, rest = tensors(make_scene())
+        drawn = dict(zip(("pictures", "alphas"), rasterization(**inputs, **rest, render_mode="RGB+D")))
+        drawn["depths"] = drawn["pictures"][..., 3:]
+        drawn["pictures"] = drawn["pictures"][..., :3]
+        sum(drawn[name].sum() for name in losses).backward()
+        return inputs["means"].grad.clone()
+
+    alone = [gradient("pictures"), gradient("alphas")]
+    gradient("pictures", "alphas", "depths")
+    assert torch.equal(gradient("alphas"), alone[1])
+    gradient("pictures", "alphas", "depths")
+    assert torch.equal(gradient("pictures"), alone[0])
+
+
 def test_colours_go_uphill():
     """Adam finds the colours of a picture."""
     scene = make_scene(n=60)
