@@ -19,7 +19,8 @@
 //!
 //! The stages ([`Stage`]), in order:
 //!
-//! 0. With [`Poses::Adjusted`], the cameras are adjusted by points matched between photographs.
+//! 0. With [`Poses::Adjusted`], the cameras are adjusted by points matched between photographs; by default
+//!    after stage 3, where its check doubts them, and stages 1 to 3 run again.
 //! 1. The initial depth range comes from [`Options::depth_range`], then from
 //!    [`Options::depth_prior`], then from the distance between the cameras.
 //! 2. The size of the network's input follows from the photographs' shapes ([`InputSize`]). Each
@@ -97,7 +98,7 @@ pub mod stages {
     pub use super::detail::add_detail;
     pub use super::equal_exposure::equalise;
     pub use super::finishing::{fit_to_inputs, refine_on_inputs};
-    pub use super::poses::{adjusted, check_pairs, located};
+    pub use super::poses::{adjusted, adjusted_if_doubted, check_pairs, located};
     pub use crate::finish::Groups;
 }
 

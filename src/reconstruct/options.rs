@@ -32,7 +32,7 @@ pub struct Options {
     /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
     /// Default: none.
     pub depth_prior: Option<DepthBounds>,
-    /// Cameras that the network receives. Default: [`Poses::Given`].
+    /// Cameras that the network receives. Default: [`Poses::Auto`].
     pub poses: Poses,
     /// Check of the poses by matched points. Default: [`Check::Warn`].
     pub check: Check,
@@ -426,8 +426,11 @@ impl Refine {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Poses {
-    /// Those of the photographs.
+    /// [`Poses::Adjusted`] where the [`Check`] finds points clearly farther from the lines that the cameras predict
+    /// than from their own, and nothing worse; else [`Poses::Given`].
     #[default]
+    Auto,
+    /// Those of the photographs.
     Given,
     /// Those of the photographs after [`crate::cameras::estimation::adjust_poses`], for cameras that are nearly right,
     /// such as a headset's. Cameras that fit the photographs stay.

@@ -142,10 +142,14 @@ impl Tracker {
         Self { costs, current: None, times: Vec::new(), fraction: 0.0 }
     }
 
-    /// Ends the current stage.
+    /// Ends the current stage. A stage that runs again has the sum of its times.
     pub(super) fn close(&mut self) {
         if let Some((stage, start)) = self.current.take() {
-            self.times.push(StageTime { stage, seconds: start.elapsed().as_secs_f64() });
+            let seconds = start.elapsed().as_secs_f64();
+            match self.times.iter_mut().find(|time| time.stage == stage) {
+                Some(time) => time.seconds += seconds,
+                None => self.times.push(StageTime { stage, seconds }),
+            }
         }
     }
 

@@ -7,6 +7,8 @@ use super::{
     Photographs, Poses, Prepared, Progress, Reconstruction, Refine, Result, Stage, check_pairs,
     check_refine, equal_exposure, estimate_cameras, is_mvsplat, poses,
 };
+use crate::cameras::check::PairReport;
+use crate::cameras::estimation::PoseAdjustment;
 use crate::network::config::{Config, Preset};
 use crate::network::model::subsplat::SubSplat;
 use crate::network::model::weights::{SUBSPLAT_PREFIX, Weights};
@@ -14,6 +16,7 @@ use crate::network::model::{Backend, Views};
 use crate::reconstruct::inputs::crop::{CropOptions, Cropped};
 use crate::reconstruct::inputs::pair::choose_sources;
 use candle_core::{Device, Tensor};
+use std::borrow::Cow;
 use std::ops::ControlFlow;
 use std::path::Path;
 use subsplat_kernels::camera::{Camera, NearFar, Size};
@@ -191,24 +194,9 @@ impl Reconstructor {
         let target_size = options.target_size.resolve(input_size, upscale, &sizes);
         let crop = CropOptions { target_size, ..self.crop_options(input_size) };
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
-        let (mut adjusted, mut adjustment) = (Vec::new(), None);
-        if options.poses == Poses::Adjusted {
-            tracker.begin(Stage::Poses, progress)?;
-            if let Some((moved, found)) = poses::adjusted(photos)? {
-                (adjusted, adjustment) = (moved, Some(found));
-            }
-        }
-        let photos = if adjusted.is_empty() { photos } else { &adjusted };
-        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
-        let guess = options.initial_depth_range(&cameras)?;
-        let mut inputs = crop_all(photos, &crop, &mut tracker, progress)?;
-        let reports = match options.check {
-            Check::Off => Vec::new(),
-            Check::Warn | Check::Refuse => {
-                tracker.begin(Stage::Check, progress)?;
-                check_pairs(photos, |part| tracker.advance(part, progress))?
-            }
-        };
+        let Posed { photos, guess, mut inputs, reports, adjustment } =
+            posed(photos, options, &crop, &mut tracker, progress)?;
+        let photos: &[Photo] = &photos;
         let corrected = equal_exposure::equalise(photos, &mut inputs, &reports);
         tracker.close();
         if options.check == Check::Refuse {
@@ -343,6 +331,57 @@ const SOURCES: usize = 2;
 
 /// Duration of one step of the fit, in the unit of [`Reconstructor::stage_costs`].
 const FIT_STEP: f32 = 0.2;
+
+/// Photographs with the cameras that the network receives.
+struct Posed<'a> {
+    photos: Cow<'a, [Photo]>,
+    /// Depth range of the cameras.
+    guess: DepthBounds,
+    inputs: Vec<Cropped>,
+    /// The check of the pairs with these cameras.
+    reports: Vec<PairReport>,
+    adjustment: Option<PoseAdjustment>,
+}
+
+/// Crops and checks `photos`, with cameras that are adjusted where [`Options::poses`] says so.
+fn posed<'a>(
+    photos: &'a [Photo],
+    options: &Options,
+    crop: &CropOptions,
+    tracker: &mut Tracker,
+    progress: &mut Callback<'_>,
+) -> Result<Posed<'a>> {
+    let (mut photos, mut adjustment) = (Cow::Borrowed(photos), None);
+    let mut found = None;
+    if options.poses == Poses::Adjusted {
+        tracker.begin(Stage::Poses, progress)?;
+        found = poses::adjusted(&photos)?;
+    }
+    let mut doubts = options.poses == Poses::Auto;
+    loop {
+        if let Some((moved, change)) = found {
+            (photos, adjustment) = (Cow::Owned(moved), Some(change));
+        }
+        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
+        let guess = options.initial_depth_range(&cameras)?;
+        let inputs = crop_all(&photos, crop, tracker, progress)?;
+        let reports = match options.check {
+            Check::Off => Vec::new(),
+            Check::Warn | Check::Refuse => {
+                tracker.begin(Stage::Check, progress)?;
+                check_pairs(&photos, |part| tracker.advance(part, progress))?
+            }
+        };
+        found = None;
+        if std::mem::take(&mut doubts) && poses::doubted(&reports) {
+            tracker.begin(Stage::Poses, progress)?;
+            found = poses::adjusted_if_doubted(&photos, &reports)?;
+        }
+        if found.is_none() {
+            return Ok(Posed { photos, guess, inputs, reports, adjustment });
+        }
+    }
+}
 
 fn crop_all(
     photos: &[Photo],

@@ -140,7 +140,11 @@ fn little_coverage(coverage: f64) -> String {
 
 fn cause_of_doubt(finding: Option<&str>) -> String {
     match finding {
-        Some(sentence) => format!("{sentence}; --adjust-poses may help"),
+        Some(sentence) => {
+            format!(
+                "{sentence}; without the file of cameras, the program estimates them from the photographs"
+            )
+        }
         None => "photographs taken closer together agree better".to_owned(),
     }
 }
@@ -174,10 +178,10 @@ mod tests {
             (agreement(0.3, 8.0), 0.95, &[], near, "agree on 30 %"),
             (agreement(0.1, 8.0), 0.95, &[], wrong, "things that moved"),
             (agreement(0.7, 8.0), 0.5, &[], near, "cover 50 %"),
-            (agreement(0.7, 8.0), 0.95, &poses, near, "miss the points by 9 px; --adjust-poses"),
+            (agreement(0.7, 8.0), 0.95, &poses, near, "miss the points by 9 px; without the file"),
             (agreement(0.25, 8.0), 0.95, &poses, wrong, "miss the points by 9 px"),
             (agreement(0.7, 2.0), 0.95, &poses, wrong, "without the file of cameras"),
-            (agreement(0.3, 8.0), 0.95, &[report("poses_imprecise")], near, "--adjust-poses"),
+            (agreement(0.3, 8.0), 0.95, &[report("poses_imprecise")], near, "without the file"),
         ];
         for (agreement, coverage, reports, trust, words) in cases {
             let verdict = judge(&agreement, coverage, reports);

@@ -2,6 +2,9 @@
 
 use glam::{Mat4, Quat, Vec3};
 use subsplat::cameras::estimation::{PosePhoto, adjust_poses, locate_photos, move_along};
+use subsplat::files::poses::scene::load_scene;
+use subsplat::network::config::{Config, Preset};
+use subsplat::{Check, Options, Photo, Poses, Reconstructor};
 use subsplat_kernels::camera::Camera;
 use subsplat_test_support::pose_errors::aligned_errors;
 use subsplat_test_support::posed_photos::{Intrinsics, PosedPhoto, photo_scene};
@@ -85,4 +88,42 @@ fn photographs_are_located_among_others() {
     // A camera that looks elsewhere is no better than the match says.
     assert_eq!(locate_photos(&features, known, &off(6.0), 1), [None, None]);
     assert_eq!(locate_photos(&features[1..], known, &off(1.0), 1), [None, None]);
+}
+
+/// By default cameras that points of the photographs contradict are adjusted, and cameras that fit stay.
+#[test]
+fn a_reconstruction_adjusts_doubted_cameras() {
+    let scene = load_scene("examples/room").unwrap();
+    let mut photos: Vec<Photo> =
+        scene.frames[..2].iter().map(|frame| Photo::from_frame(frame).unwrap()).collect();
+    let model = Reconstructor::untrained(&Config::small(Preset::Tuned, 2), 7).unwrap();
+    let prepared = |photos: &[Photo], options: Options| {
+        let options = options.with_input_size(96, 96);
+        let prepared = model.prepare(photos, &options).unwrap();
+        // Between the two: a common turn is a matter of the world's axes.
+        let relative = prepared.inputs()[0].input_camera.rotation().transpose()
+            * prepared.inputs()[1].input_camera.rotation();
+        let truth =
+            scene.frames[0].camera.rotation().transpose() * scene.frames[1].camera.rotation();
+        let error = Quat::from_mat3(&(relative.transpose() * truth));
+        let error = 2.0 * error.xyz().length().asin().to_degrees();
+        (prepared.pose_adjustment().is_some(), error)
+    };
+    let (adjusts, error) = prepared(&photos, Options::default());
+    assert!(!adjusts && error < 1e-3, "cameras that fit: {error}");
+    let wrong = disturbed(photos[1].camera(), 1, 0.8, 0.0);
+    photos[1] = photos[1].with_camera(wrong).unwrap();
+    let (adjusts, error) = prepared(&photos, Options::default());
+    assert!(adjusts && error < 0.2, "{error}");
+    for options in [
+        Options::default().with_poses(Poses::Given),
+        // Without a comparison nothing is doubted.
+        Options::default().with_check(Check::Off),
+    ] {
+        let (adjusts, error) = prepared(&photos, options);
+        assert!(!adjusts && (error - 0.8).abs() < 0.01, "{error}");
+    }
+    let (adjusts, error) =
+        prepared(&photos, Options::default().with_poses(Poses::Adjusted).with_check(Check::Off));
+    assert!(adjusts && error < 0.2, "{error}");
 }

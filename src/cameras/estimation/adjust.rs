@@ -25,7 +25,7 @@ const MAX_ERROR_SHARE: f64 = 0.8;
 const FITTING_PX: f64 = 1.0;
 /// Points for each photograph that tell errors below [`FITTING_PX`]. Chosen on five photographs of eight
 /// scenes of `../shared/photos`, of which one has fewer points: 18.6 dB adjusted, 20.3 dB as given.
-const CERTAIN_POINTS: usize = 100;
+pub(crate) const CERTAIN_POINTS: usize = 100;
 
 /// Result of [`adjust_poses`].
 #[derive(Clone, Debug, PartialEq)]

@@ -15,6 +15,7 @@ use super::SaveOptions;
 use crate::files::{Error, Result};
 use crate::scene::splats::{SplatParts, Splats};
 use glam::{DMat3, DQuat, DVec3};
+use std::ops::Range;
 use std::path::Path;
 use subsplat_kernels::layout::{
     OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE, ShBasis, sh_coefficients,
@@ -141,7 +142,23 @@ impl<'a> Outgoing<'a> {
 
     /// Iterates over the indices of the Gaussians that are written.
     pub fn kept(&self) -> impl Iterator<Item = usize> {
-        (0..self.splats.len()).filter(|&i| self.keeps(i))
+        self.kept_of(0..self.len())
+    }
+
+    /// Those of the splats `range` that will be written.
+    pub fn kept_of(&self, range: Range<usize>) -> impl Iterator<Item = usize> {
+        range.filter(|&i| self.keeps(i))
+    }
+
+    /// Number of splats, with those that will not be written.
+    pub fn len(&self) -> usize {
+        self.splats.len()
+    }
+
+    /// All splats as runs of `len`, the last one shorter.
+    pub fn runs(&self, len: usize) -> impl Iterator<Item = Range<usize>> {
+        let n = self.len();
+        (0..n).step_by(len).map(move |first| first..(first + len).min(n))
     }
 
     fn keeps(&self, i: usize) -> bool {

@@ -21,6 +21,7 @@ pub mod compressed_ply;
 mod gaussians;
 pub mod glb;
 mod glb_read;
+mod gzip;
 pub mod ksplat;
 pub mod ply;
 mod ply_container;

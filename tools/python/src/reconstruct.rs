@@ -45,7 +45,7 @@ pub(crate) fn reconstruct(
     gaussians: Option<&Bound<'_, PyAny>>,
     refine_seconds: Option<&Bound<'_, PyAny>>,
     upscale: &Bound<'_, PyAny>,
-    adjust_poses: bool,
+    adjust_poses: Option<bool>,
     weights: Option<PathBuf>,
     progress: Option<&Bound<'_, PyAny>>,
 ) -> PyResult<Scene> {
@@ -59,8 +59,8 @@ pub(crate) fn reconstruct(
         other => return Err(error::value("quality", "fast, normal, high or best", other)),
     };
     let mut options = Options::default().with_quality(level);
-    if adjust_poses {
-        options = options.with_poses(Poses::Adjusted);
+    if let Some(adjusts) = adjust_poses {
+        options = options.with_poses(if adjusts { Poses::Adjusted } else { Poses::Given });
     }
     if let Some(count) = optional_whole("gaussians", gaussians, 1..=usize::MAX)? {
         options = options.with_density(Density::Count(count));

@@ -27,7 +27,6 @@ use subsplat_kernels::camera::Size;
 /// distance is necessary.
 pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Options> {
     let check = if args.no_check { Check::Off } else { Check::Warn };
-    let poses = if args.adjust_poses { Poses::Adjusted } else { Poses::Given };
     let matching = match args.matching {
         MatchingArg::Photo => Matching::Photographs,
         MatchingArg::Off => Matching::Off,
@@ -44,7 +43,7 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_check(check)
         .with_matching(matching)
         .with_detail(detail)
-        .with_poses(poses);
+        .with_poses(args.adjust_poses.into());
     options.fit.steps = args.fit.unwrap_or(options.fit.steps);
     options.refine = args.refine.unwrap_or(options.refine);
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
@@ -188,7 +187,7 @@ fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {
     match prepared.pose_adjustment() {
         Some(a) => print_line(format!(
             "the cameras were adjusted to {} points that the photographs share: turned by {:.2} degrees \
-             at most; median error of the points {:.2} px before, {:.2} px now",
+             at most; median error of the points {:.2} px before, {:.2} px now (--adjust-poses=never keeps them)",
             a.points, a.turned_deg, a.before_px, a.after_px
         )),
         None if poses == Poses::Adjusted => {

@@ -12,6 +12,7 @@ use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, 
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use subsplat::cameras::estimation::move_along;
 use subsplat::files::SaveOptions;
 use subsplat::files::photos::image::{LoadOptions, Truncated};
 use subsplat::files::photos::notes::grouped;
@@ -20,6 +21,7 @@ use subsplat::network::config::{Config, LowpassRef};
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
 use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
+use subsplat::reconstruct::stages::located;
 use subsplat::reconstruct::{Assessment, Backend};
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{
@@ -87,6 +89,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, args.source.pair.force, &mut progress)?;
     let result = reconstruct(&model, photos, &plan.options, &mut progress)?;
+    follow_adjustment(&mut plan, &targets, &result, args.source.pair.force, &mut progress)?;
     check_opacity(result.splats(), args.content.min_opacity)?;
     let options = raster_options(&args.rendering, model.config(), &result);
     let views = views(args, &targets, &result)?;
@@ -217,6 +220,49 @@ pub fn photographs(
         grouped(lines).iter().for_each(print_warning);
     }
     Ok(photos)
+}
+
+/// Locates the frames `targets` among the photographs of the scene where the cameras of these were adjusted: those of
+/// the file belong to the cameras before. A target with too few matches follows them by one similarity.
+fn follow_adjustment(
+    plan: &mut Plan,
+    targets: &[usize],
+    result: &Reconstruction,
+    force: bool,
+    progress: &mut Progress,
+) -> Result<()> {
+    /// Photographs that are in memory beside those of the scene.
+    const TOGETHER: usize = 8;
+    let frames = &plan.scene.frames;
+    let targets: Vec<usize> =
+        targets.iter().copied().filter(|&i| frames[i].cut.is_none()).collect();
+    if result.pose_adjustment().is_none() || targets.is_empty() {
+        return Ok(());
+    }
+    let cameras = |of: &[usize]| of.iter().map(|&i| frames[i].camera).collect::<Vec<_>>();
+    let adjusted: Vec<Camera> = result.inputs().iter().map(|c| c.input_camera).collect();
+    let given = cameras(&targets);
+    let mut moved = move_along(&cameras(&plan.context), &adjusted, &given).unwrap_or(given);
+    let posed = |photos: Vec<Photo>, cameras: &[Camera]| {
+        let pairs = photos.iter().zip(cameras);
+        pairs
+            .map(|(photo, to)| {
+                photo.with_camera(photo.camera().with_pose_unchecked(to.world_from_camera()))
+            })
+            .collect::<subsplat::Result<Vec<_>>>()
+    };
+    let inputs = posed(photographs(&plan.scene, &plan.context, force, progress)?, &adjusted)?;
+    for (targets, moved) in targets.chunks(TOGETHER).zip(moved.chunks_mut(TOGETHER)) {
+        let photos = posed(photographs(&plan.scene, targets, force, progress)?, moved)?;
+        let found = progress.stage("cameras", |_| located(&inputs, &photos))?;
+        moved.iter_mut().zip(found).for_each(|(moved, found)| *moved = found.unwrap_or(*moved));
+    }
+    for (i, to) in targets.iter().zip(&moved) {
+        let camera = &mut plan.scene.frames[*i].camera;
+        *camera = camera.with_pose_unchecked(to.world_from_camera());
+    }
+    print_line("the photographs to compare with were located among the adjusted cameras");
+    Ok(())
 }
 
 /// Chooses the context frames of the scene at `input`: those that `args` name, or a default. Returns

@@ -4,7 +4,7 @@ use crate::eval::{Disturbance, Method};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 use subsplat::{Density, Refine};
-use subsplat_cli::commands::args::{DetailArg, ModelArgs};
+use subsplat_cli::commands::args::{AdjustPosesArg, DetailArg, ModelArgs};
 use subsplat_cli::commands::values;
 
 const NOTES: &str = "\
@@ -80,10 +80,18 @@ pub struct EvalArgs {
     /// at the inputs' cameras are then those of the disturbed inputs.
     #[arg(long, value_delimiter = ',', value_name = "D,…", value_parser = disturbance)]
     pub disturb: Vec<Disturbance>,
-    /// Adjust the inputs' cameras by points matched between them, as in `run`. Targets are located by
-    /// points that they share with the inputs; without enough, they follow by one similarity.
-    #[arg(long)]
-    pub adjust_poses: bool,
+    /// Adjust the inputs' cameras by points matched between them, as in `run`: auto, always, never. Targets are then
+    /// located by points that they share with the inputs; without enough, they follow by one similarity.
+    #[arg(
+        long,
+        value_name = "WHEN",
+        value_enum,
+        num_args = 0..=1,
+        require_equals = true,
+        default_value = "auto",
+        default_missing_value = "always"
+    )]
+    pub adjust_poses: AdjustPosesArg,
     /// Give the inputs the exposure and white balance of one of them, as `run` does. Of two inputs it
     /// is the first.
     #[arg(long)]

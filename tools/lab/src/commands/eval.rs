@@ -61,7 +61,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
         },
         disturbances: args.disturb.clone(),
         preparation: Preparation {
-            poses: if args.adjust_poses { Poses::Adjusted } else { Poses::Given },
+            poses: args.adjust_poses.into(),
             equal_exposure: args.equal_exposure,
         },
         density: args.gaussians,
@@ -321,7 +321,11 @@ fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -
         "crop": if options.rule == CropRule::Mvsplat { "mvsplat" } else { "exact" },
         "lr_from": if options.lr_from == LrFrom::HrCrop { "hr_crop" } else { "independent" },
         "disturbances": args.disturb.iter().map(|d| d.name()).collect::<Vec<_>>(),
-        "poses": if args.adjust_poses { "adjusted" } else { "given" },
+        "poses": match options.preparation.poses {
+            Poses::Adjusted => "adjusted",
+            Poses::Given => "given",
+            _ => "auto",
+        },
         "equal_exposure": args.equal_exposure,
         "weights": args.weights.as_ref().map(|p| p.display().to_string()),
         "seed": args.seed,

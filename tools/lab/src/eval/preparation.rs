@@ -2,7 +2,9 @@
 
 use subsplat::cameras::estimation::move_along;
 use subsplat::reconstruct::inputs::crop::Cropped;
-use subsplat::reconstruct::stages::{adjusted, check_pairs, equalise, located};
+use subsplat::reconstruct::stages::{
+    adjusted, adjusted_if_doubted, check_pairs, equalise, located,
+};
 use subsplat::reconstruct::{Photo, Poses, Result};
 use subsplat_kernels::camera::Camera;
 
@@ -10,7 +12,7 @@ use subsplat_kernels::camera::Camera;
 /// disturbances.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Preparation {
-    /// Cameras of the inputs. With adjusted ones, the targets are located by points matched with the
+    /// Cameras of the inputs. By default they are adjusted as `run` does. With adjusted ones, the targets are located by points matched with the
     /// inputs, because a target's own camera is in the frame of the cameras before. Targets with too few
     /// matches follow the inputs by one similarity.
     pub poses: Poses,
@@ -33,14 +35,17 @@ impl Preparation {
         truth: &[Photo],
         targets: &mut [Cropped],
     ) -> Result<()> {
-        if self == Self::default() {
+        if self.poses == Poses::Given && !self.equal_exposure {
             return Ok(());
         }
         let mut photos = photos(inputs)?;
-        if self.poses == Poses::Adjusted {
-            if let Some((moved, _)) = adjusted(&photos)? {
-                photos = moved;
-            }
+        let found = match self.poses {
+            Poses::Given => None,
+            Poses::Adjusted => adjusted(&photos)?,
+            _ => adjusted_if_doubted(&photos, &check_pairs(&photos, |_| Ok(()))?)?,
+        };
+        if self.poses == Poses::Adjusted || found.is_some() {
+            photos = found.map_or(photos, |(moved, _)| moved);
             let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
             inputs.iter_mut().zip(&cameras).for_each(|(c, camera)| place(c, camera));
             let seen: Vec<Camera> = truth.iter().map(|p| *p.camera()).collect();

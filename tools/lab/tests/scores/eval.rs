@@ -143,7 +143,7 @@ fn prepared_inputs_come_back_from_disturbances() {
     };
     let psnr = |r: &CaseResult| r.scores.targets[0].scores[0].psnr;
     let grey = |p: &Rgb| p.data.iter().map(|v| f64::from(*v)).sum::<f64>() / p.data.len() as f64;
-    let given = Preparation::default();
+    let given = Preparation { poses: Poses::Given, equal_exposure: false };
     let adjusted = Preparation { poses: Poses::Adjusted, ..given };
     let equal = Preparation { equal_exposure: true, ..given };
     let plain = run(None, given);

@@ -106,7 +106,7 @@ def reconstruct(
     gaussians: Optional[int],
     refine_seconds: Optional[int],
     upscale: int,
-    adjust_poses: bool,
+    adjust_poses: Optional[bool],
     weights: Optional[str | PathLike[str]],
     progress: _Progress,
 ) -> Scene: ...

@@ -59,7 +59,7 @@ def reconstruct(
     gaussians: Optional[int] = None,
     refine_seconds: Optional[int] = None,
     upscale: int = 2,
-    adjust_poses: bool = False,
+    adjust_poses: Optional[bool] = None,
     weights: Optional[Path] = None,
     progress: Progress = None,
 ) -> Scene:
@@ -71,7 +71,8 @@ def reconstruct(
     cameras: one for each photograph of a list. Without, the cameras are estimated.
     quality: "fast", "normal", "high" or "best". gaussians: at most this number after the refinement.
     refine_seconds: time of the refinement, 0 for none. upscale: 1 to 8, Gaussians per input pixel and side.
-    adjust_poses: corrects cameras that are nearly right. weights: a file of weights.
+    adjust_poses: corrects cameras that are nearly right; None where points of the photographs contradict them.
+    weights: a file of weights.
     progress: a function of a stage (text) and the share that is done (0 to 1); True shows a bar (tqdm).
 
     Ctrl-C stops the call. Raises ValueError where the photographs do not determine their cameras, and OSError

@@ -27,8 +27,8 @@ pub use render::RenderArgs;
 pub use rendering::{ConventionArg, LowpassArg, MotionArgs, PathArg, RenderingArgs};
 pub use run::{PictureSizeArg, RunArgs};
 pub use source::{
-    BackboneArg, CropShapeArg, DetailArg, InputSizeArg, MatchingArg, ModelArgs, PresetArg,
-    QualityArg, SourceArgs,
+    AdjustPosesArg, BackboneArg, CropShapeArg, DetailArg, InputSizeArg, MatchingArg, ModelArgs,
+    PresetArg, QualityArg, SourceArgs,
 };
 
 use super::values;

@@ -5,7 +5,7 @@ use super::groups::{CAMERAS, NETWORK, QUALITY, SIZE};
 use crate::commands::values;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
-use subsplat::{Density, InputSize, Quality, Refine, TargetSize};
+use subsplat::{Density, InputSize, Poses, Quality, Refine, TargetSize};
 
 /// Options of a reconstruction: of `run` and `view`.
 #[derive(Clone, Debug, Args)]
@@ -19,12 +19,24 @@ pub struct SourceArgs {
     /// Cameras of photographs without a pose file.
     #[command(flatten)]
     pub pair: PairArgs,
-    /// Correct given cameras that are nearly right.
+    /// Correct given cameras that are nearly right: auto, always, never [default: auto].
     ///
-    /// A headset gives such cameras. They are adjusted by points that the photographs share. Cameras that agree with the
-    /// photographs stay.
-    #[arg(long, help_heading = CAMERAS)]
-    pub adjust_poses: bool,
+    /// Phones and headsets give such cameras. They are adjusted by points that the photographs share. auto: where the
+    /// comparison of the photographs doubts the cameras. Cameras that agree with the photographs stay. The flag alone:
+    /// always.
+    #[arg(
+        long,
+        value_name = "WHEN",
+        value_enum,
+        num_args = 0..=1,
+        require_equals = true,
+        default_value = "auto",
+        default_missing_value = "always",
+        hide_default_value = true,
+        hide_possible_values = true,
+        help_heading = CAMERAS
+    )]
+    pub adjust_poses: AdjustPosesArg,
     /// Do not compare the photographs before the reconstruction.
     ///
     /// The comparison finds cameras that disagree with the photographs, differences of exposure, and the
@@ -249,6 +261,27 @@ pub enum CropShapeArg {
     Whole,
     /// The square in the middle.
     Square,
+}
+
+/// Correction of given cameras.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum AdjustPosesArg {
+    /// Where the comparison of the photographs doubts them.
+    Auto,
+    /// Wherever points of the photographs contradict them.
+    Always,
+    /// None.
+    Never,
+}
+
+impl From<AdjustPosesArg> for Poses {
+    fn from(when: AdjustPosesArg) -> Self {
+        match when {
+            AdjustPosesArg::Auto => Self::Auto,
+            AdjustPosesArg::Always => Self::Adjusted,
+            AdjustPosesArg::Never => Self::Given,
+        }
+    }
 }
 
 /// Correction of the network's distances.

@@ -2,7 +2,8 @@
 
 use super::groups::{PICTURES, SIZE};
 use super::{
-    ConventionArg, CropShapeArg, DetailArg, MatchingArg, QualityArg, RenderingArgs, SourceArgs,
+    AdjustPosesArg, ConventionArg, CropShapeArg, DetailArg, MatchingArg, QualityArg, RenderingArgs,
+    SourceArgs,
 };
 use crate::commands::values;
 use clap::{Args, ValueEnum};
@@ -154,7 +155,7 @@ impl ViewArgs {
             (source.model.preset.is_some(), "--preset"),
             (source.model.config.is_some(), "--config"),
             (source.no_check, "--no-check"),
-            (source.adjust_poses, "--adjust-poses"),
+            (source.adjust_poses != AdjustPosesArg::Auto, "--adjust-poses"),
             (source.pair.pose_convention.is_some(), "--pose-convention"),
         ];
         flags.into_iter().find(|f| f.0).map(|f| f.1).or(source.pair.first_flag())
