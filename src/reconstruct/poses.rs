@@ -79,17 +79,28 @@ pub fn check_pairs(
 /// scenes have at most 1.3, the two of a headset and one clip up to 7. Adjusted, nine photographs of the headset's gain
 /// 1.2 dB in new views, five 0.8 dB.
 const DOUBTED: f32 = 2.0;
-/// Accuracy of a match, px of a photograph of 640 px: smaller distances from their own lines count as this.
+/// Accuracy of a match, px of a photograph of [`REPORT_SIDE`] or more: smaller distances from their own lines count
+/// as this.
 const MATCH_PX: f32 = 0.25;
+/// Longer side of the photographs to which a report's px refer, px.
+const REPORT_SIDE: f32 = 640.0;
 
 /// Returns whether points tell that cameras are nearly right, but not right: those of a pair lie [`DOUBTED`] times
 /// as far from the cameras' lines as from their own, and no pair's cameras are wrong.
-pub(super) fn doubted(reports: &[PairReport]) -> bool {
+pub(super) fn doubted(photos: &[Photo], reports: &[PairReport]) -> bool {
+    let side = |p: &Photo| p.size().width.max(p.size().height);
+    let smallest = photos.iter().map(side).min().unwrap_or(0).max(1);
+    // A match in a smaller photograph is less accurate in the px of a report.
+    doubts(reports, MATCH_PX * (REPORT_SIDE / smallest as f32).max(1.0))
+}
+
+/// [`doubted`] where a match is accurate to `accuracy` px of a report.
+fn doubts(reports: &[PairReport], accuracy: f32) -> bool {
     let wrong = |r: &PairReport| r.findings.iter().any(|f| f.code == "poses_wrong");
     let far = |r: &PairReport| {
         let epipolar = r.epipolar.as_ref();
         epipolar.is_some_and(|e| {
-            e.median_px.is_some_and(|px| px >= DOUBTED * e.own_median_px.max(MATCH_PX))
+            e.median_px.is_some_and(|px| px >= DOUBTED * e.own_median_px.max(accuracy))
         })
     };
     reports.iter().any(far) && !reports.iter().any(wrong)
@@ -122,7 +133,7 @@ pub fn adjusted_if_doubted(
     photos: &[Photo],
     reports: &[PairReport],
 ) -> Result<Option<(Vec<Photo>, PoseAdjustment)>> {
-    if !doubted(reports) {
+    if !doubted(photos, reports) {
         return Ok(None);
     }
     Ok(adjusted(photos)?.filter(|(_, found)| found.points >= CERTAIN_POINTS * photos.len()))
@@ -204,12 +215,14 @@ mod tests {
             }),
             ..PairReport::default()
         };
+        let doubted = |reports: &[PairReport]| doubts(reports, MATCH_PX);
         let fits = report(Some(0.4), 0.3);
         assert!(doubted(&[fits.clone(), report(Some(0.61), 0.3)]));
         assert!(!doubted(&[fits.clone(), report(Some(0.59), 0.3)]));
         // Below the accuracy of a match, half of it is no doubt.
         assert!(!doubted(&[report(Some(0.3), 0.1)]) && doubted(&[report(Some(0.5), 0.1)]));
         assert!(!doubted(&[report(None, 0.3), PairReport::default()]) && !doubted(&[]));
+        assert!(!doubts(&[report(Some(1.9), 0.3)], 1.0) && doubts(&[report(Some(2.1), 0.3)], 1.0));
         // Wrong cameras are not nearly right.
         let code = "poses_wrong".to_owned();
         let finding = Finding { severity: Verdict::Bad, code, sentence: String::new() };

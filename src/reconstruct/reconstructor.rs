@@ -373,7 +373,7 @@ fn posed<'a>(
             }
         };
         found = None;
-        if std::mem::take(&mut doubts) && poses::doubted(&reports) {
+        if std::mem::take(&mut doubts) && poses::doubted(&photos, &reports) {
             tracker.begin(Stage::Poses, progress)?;
             found = poses::adjusted_if_doubted(&photos, &reports)?;
         }

@@ -261,7 +261,8 @@ fn bytes_after_the_end_are_an_error_or_are_not_read() {
 #[test]
 fn wrong_checksums_are_an_error() {
     for (name, bytes, from, most) in [
-        ("gzip", written("a.spz", &small(1)), 10, 12),
+        // Decoders ignore the bits before each of eight stored blocks, up to a whole byte.
+        ("gzip", written("a.spz", &small(1)), 10, 12 + 8 * 7),
         ("zstd", spz4(&small(1), zstd), 32 + 6 * 16, 6 * 10),
     ] {
         let good = answer("spz", parse_spz, &bytes).unwrap();
