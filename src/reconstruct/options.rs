@@ -41,8 +41,9 @@ pub struct Options {
     pub matching: Matching,
     /// Source of colour detail. Default: [`Detail::Photographs`].
     pub detail: Detail,
-    /// Fit of the Gaussians to the photographs ([`crate::finish::fit()`]). Default: four steps.
-    pub fit: FitOptions,
+    /// Fit of the Gaussians to the photographs ([`crate::finish::fit()`]). Default: four steps where the refinement
+    /// needs them ([`RefineOptions::needs_fit`]), else none.
+    pub fit: Option<FitOptions>,
     /// Refinement of the Gaussians on the photographs ([`crate::finish::refine()`]). Default:
     /// [`Refine::Auto`].
     pub refine: Refine,
@@ -53,8 +54,7 @@ pub struct Options {
 }
 
 impl Options {
-    /// Sets [`Options::input_size`], [`Options::density`], the steps of [`Options::fit`], and
-    /// [`Options::refine`] by one level of quality. Setters that follow override single values.
+    /// Sets [`Options::input_size`], [`Options::density`] and [`Options::refine`] by one level of quality. Setters that follow override single values.
     ///
     /// ```
     /// use subsplat::reconstruct::{InputSize, Options, Quality, Refine};
@@ -64,10 +64,9 @@ impl Options {
     /// ```
     #[must_use]
     pub fn with_quality(mut self, quality: Quality) -> Self {
-        let QualitySettings { input_size, density, fit_steps, refine } = quality.settings();
+        let QualitySettings { input_size, density, refine } = quality.settings();
         self.input_size = input_size;
         self.density = density;
-        self.fit.steps = fit_steps;
         self.refine = refine;
         self
     }
@@ -142,8 +141,8 @@ impl Options {
     /// Sets [`Options::fit`]; [`FitOptions::off`] keeps the network's Gaussians, unless
     /// [`Options::refine`] names a number of steps.
     #[must_use]
-    pub fn with_fit(mut self, fit: FitOptions) -> Self {
-        self.fit = fit;
+    pub fn with_fit(mut self, fit: impl Into<Option<FitOptions>>) -> Self {
+        self.fit = fit.into();
         self
     }
 
@@ -174,18 +173,29 @@ impl Options {
     /// Options of the refinement on which that of the primaries depends.
     pub(super) fn parents_options(&self, photographs: usize) -> RefineOptions {
         let refine = self.parents.unwrap_or(self.refine);
-        refine.options_for(photographs, self.fit.steps > 0)
+        refine.options_for(photographs, self.changes_sizes())
+    }
+
+    /// Returns whether the Gaussians may be changed where [`Options::refine`] names no number of steps.
+    fn changes_sizes(&self) -> bool {
+        self.fit.is_none_or(|fit| fit.steps > 0)
+    }
+
+    /// Options of the fit for a number of photographs.
+    pub(super) fn fit_options(&self, photographs: usize) -> FitOptions {
+        let needs = || self.refine_options(photographs).needs_fit(photographs);
+        self.fit.unwrap_or_else(|| if needs() { FitOptions::default() } else { FitOptions::off() })
     }
 
     /// Returns whether depth is matched: not where the Gaussians are to stay the network's.
     pub(super) fn matches_depth(&self) -> bool {
-        let stays = self.fit.steps == 0 && self.refine_options(2).steps == 0;
+        let stays = !self.changes_sizes() && self.refine_options(2).steps == 0;
         self.matching == Matching::Photographs && !stays
     }
 
     /// Options of the refinement for a number of photographs.
     pub(super) fn refine_options(&self, photographs: usize) -> RefineOptions {
-        self.refine.options_for(photographs, self.fit.steps > 0)
+        self.refine.options_for(photographs, self.changes_sizes())
     }
 
     /// The depth range before any photograph is read: [`Options::depth_range`], then
@@ -256,8 +266,6 @@ pub struct QualitySettings {
     pub input_size: InputSize,
     /// [`Options::density`].
     pub density: Density,
-    /// [`FitOptions::steps`] of [`Options::fit`].
-    pub fit_steps: usize,
     /// [`Options::refine`].
     pub refine: Refine,
 }
@@ -268,8 +276,8 @@ impl Quality {
 
     /// Returns the options of this level.
     pub fn settings(self) -> QualitySettings {
-        let Options { input_size, density, fit, refine, .. } = Options::default();
-        let normal = QualitySettings { input_size, density, fit_steps: fit.steps, refine };
+        let Options { input_size, density, refine, .. } = Options::default();
+        let normal = QualitySettings { input_size, density, refine };
         match self {
             Self::Fast => QualitySettings {
                 input_size: InputSize::Area(192 * 192),
@@ -489,7 +497,6 @@ mod tests {
             let set = QualitySettings {
                 input_size: options.input_size,
                 density: options.density,
-                fit_steps: options.fit.steps,
                 refine: options.refine,
             };
             assert_eq!(set, *a);
@@ -497,6 +504,25 @@ mod tests {
         // The level does not touch what it does not name.
         let adjusted = Options::default().with_poses(Poses::Adjusted);
         assert_eq!(adjusted.with_quality(Quality::High).poses, Poses::Adjusted);
+    }
+
+    #[test]
+    fn a_refinement_of_three_photographs_needs_no_fit() {
+        let steps = |options: Options, photographs: usize| options.fit_options(photographs).steps;
+        assert_eq!([2, 3, 9].map(|n| steps(Options::default(), n)), [4, 0, 0]);
+        let few = || Options::default().with_refine(Refine::Steps(29));
+        assert_eq!([steps(few(), 3), steps(few().with_refine(Refine::Steps(30)), 3)], [4, 0]);
+        assert_eq!(steps(few().with_refine(Refine::Off), 3), 4);
+        assert_eq!(steps(few().with_refine(Refine::Seconds(60)), 3), 4);
+        // What was asked for stays.
+        let asked = |n: usize| Options::default().with_fit(FitOptions::default().with_steps(n));
+        assert_eq!([steps(asked(7), 5), steps(asked(0), 2)], [7, 0]);
+        // Without a fit that was asked for, the Gaussians stay the network's.
+        assert_eq!(asked(0).refine_options(3).steps, 0);
+        assert!(
+            Options::default().refine_options(3).steps >= 30
+                && !asked(0).with_refine(Refine::Auto).matches_depth()
+        );
     }
 
     #[test]

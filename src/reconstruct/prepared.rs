@@ -157,7 +157,7 @@ impl Prepared<'_> {
         let SceneChildren { mut splats, mut groups, distances, .. } = children;
         let mut raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
-        let fit_options = &options.fit;
+        let fit_options = &options.fit_options(inputs.len());
         let mut refine_options = options.refine_options(inputs.len());
         if let (Some(time), Some(used)) =
             (refine_options.time, parents_options.and_then(|options| options.time))

@@ -318,7 +318,7 @@ impl Reconstructor {
             (Stage::Parents, FIT_STEP * refinement_of_parents / n * pixels / 4.0),
             (Stage::Subsplat, if aggregates { 0.25 } else { 0.06 } * pixels),
             (Stage::Detail, if options.detail == Detail::Off { 0.0 } else { 0.01 * pixels }),
-            (Stage::Fit, FIT_STEP * options.fit.steps as f32 * pixels * children),
+            (Stage::Fit, FIT_STEP * options.fit_options(photos).steps as f32 * pixels * children),
             // A step draws one photograph instead of all.
             (Stage::Refine, FIT_STEP * refinement / n * pixels * children),
         ];

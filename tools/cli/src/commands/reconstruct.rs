@@ -9,8 +9,8 @@ use serde_json::{Value, json};
 use std::borrow::Borrow;
 use subsplat::cameras::check::{PairReport, Verdict};
 use subsplat::files::poses::scene::Scene;
-use subsplat::finish::FitReport;
 use subsplat::finish::RefineReport;
+use subsplat::finish::{FitOptions, FitReport};
 use subsplat::network::config::Config;
 use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
@@ -44,7 +44,7 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_matching(matching)
         .with_detail(detail)
         .with_poses(args.adjust_poses.into());
-    options.fit.steps = args.fit.unwrap_or(options.fit.steps);
+    options.fit = args.fit.map(|steps| FitOptions::default().with_steps(steps));
     options.refine = args.refine.unwrap_or(options.refine);
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
     options.initial_depth_range(&cameras)?;

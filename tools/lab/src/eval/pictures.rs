@@ -364,10 +364,11 @@ impl<'a> PictureMaker<'a> {
         let mut children = network.children(model, &encoding, inputs, self.density, &small)?;
         children.add_offsets(&own);
         let at = (model, inputs, ratio);
-        let mut children = self.refined(network, children, at, &IN_ORDER[1..])?;
+        let options = self.refine.options_for(inputs.len(), true);
+        let steps = if options.needs_fit(inputs.len()) { &IN_ORDER[1..] } else { &IN_ORDER[1..2] };
+        let mut children = self.refined(network, children, at, steps)?;
         let SceneChildren { splats, groups, .. } = &mut children;
         let raster = self.raster_options(network, ratio, None);
-        let options = self.refine.options_for(inputs.len(), true);
         let mut step = |_: &PhaseRun<'_>| ControlFlow::Continue(());
         let renderer = &mut renderer;
         refine_on_inputs(splats, groups, inputs, &raster, &options, renderer, &mut step)?;

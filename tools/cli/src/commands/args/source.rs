@@ -108,8 +108,8 @@ pub struct SourceArgs {
     ///
     /// The network's splats look blurred. Each step compares pictures of them with the photographs,
     /// and changes all splats a little, but not their places. 0 leaves the splats as the
-    /// network made them; --refine is then left out too, unless it gives a number. Default: 4 at every
-    /// level of --quality.
+    /// network made them; --refine is then left out too, unless it gives a number. Default: 4; of three
+    /// photographs or more none where --refine has 30 steps or more, which do the same.
     #[arg(long, value_name = "STEPS", hide_short_help = true, help_heading = QUALITY)]
     pub fit: Option<usize>,
     /// Steps that move and reshape the splats so that new views become sharper.
