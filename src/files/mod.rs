@@ -23,6 +23,7 @@ pub use splats::{
 use std::fs::File;
 use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use thiserror::Error;
 
 /// Reason for which a file is refused or cannot be written.
@@ -110,9 +111,12 @@ fn lower_extension(path: &Path) -> String {
     path.extension().unwrap_or_default().to_string_lossy().to_lowercase()
 }
 
+/// Number of the next temporary file of this process.
+static TEMPORARY: AtomicU64 = AtomicU64::new(0);
+
 /// Writes `path` through `body`: to a temporary file in the same folder, which is flushed to
 /// the disk and renamed. An error removes the temporary file and leaves the old file as it
-/// was.
+/// was. Each call has a temporary file of its own: of several at once the last one that ends stays.
 ///
 /// # Errors
 /// No such folder, no permission, full disk; the error of `body`.
@@ -123,7 +127,8 @@ pub fn write_atomic(
     let path = path.as_ref();
     let name = path.file_name().ok_or_else(|| Error::format(path, "a file name", "a folder"))?;
     let mut temporary = name.to_owned();
-    temporary.push(format!(".{}.part", std::process::id()));
+    let number = TEMPORARY.fetch_add(1, Ordering::Relaxed);
+    temporary.push(format!(".{}-{number}.part", std::process::id()));
     let temporary = path.with_file_name(temporary);
     let attempt = || -> std::io::Result<()> {
         let mut file = BufWriter::new(File::create(&temporary)?);
@@ -144,6 +149,22 @@ pub fn write_atomic(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn two_writes_at_once_are_both_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.bin");
+        write_atomic(&path, |f| {
+            f.write_all(b"outer ")?;
+            f.flush()?;
+            write_atomic(&path, |f| f.write_all(b"inner")).unwrap();
+            assert_eq!(read(&path).unwrap(), b"inner");
+            f.write_all(b"file")
+        })
+        .unwrap();
+        assert_eq!(read(&path).unwrap(), b"outer file");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
 
     #[test]
     fn a_failed_write_leaves_the_old_file_and_no_other() {

@@ -138,3 +138,91 @@ pub(crate) fn families(splats: &Splats, keep: &[bool]) -> Splats {
     let (rows, sh, gain) = (part(&splats.rows), part(&splats.sh), part(&splats.gain));
     Splats { rows, sh, gain, sh_degree: splats.sh_degree, sh_basis: splats.sh_basis }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::finish::RefineOptions;
+    use crate::scene::pictures::Rgb;
+    use glam::Mat4;
+    use subsplat_kernels::camera::{Camera, Intrinsics};
+    use subsplat_kernels::layout::ShBasis;
+
+    /// One Gaussian a parent in front of a camera at the origin, at these x and with these σ.
+    fn splats(at: &[[f32; 2]]) -> Splats {
+        let row = |&[x, s]: &[f32; 2]| [x, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, s, s, s, 0.9];
+        let (rows, sh) = (at.iter().flat_map(row).collect(), vec![0.5; 3 * at.len()]);
+        Splats::new(rows, sh, Vec::new(), 0, ShBasis::Standard).unwrap()
+    }
+
+    fn camera() -> Camera {
+        Camera::new(Intrinsics::from_fov_x(1.0, 32, 32), Mat4::IDENTITY).unwrap()
+    }
+
+    /// The threshold as a number, by cases 2 % below and above it.
+    #[test]
+    fn parents_below_the_least_share_are_hidden_from_three_photographs_on() {
+        assert_eq!(RefineOptions::default().least_share, 0.3);
+        assert_eq!(hidden(&[0.98 * 0.3, 0.3, 1.02 * 0.3], 3, LEAST_SHARE), [true, false, false]);
+        assert_eq!(hidden(&[0.0, 1.0], 2, LEAST_SHARE), [false, false]);
+    }
+
+    /// Shares add up to the mean alpha: one parent of two covers the picture, the other one lies beside it.
+    #[test]
+    fn shares_are_weights_over_those_of_an_average_parent() {
+        let (camera, image) = (camera(), Rgb { width: 32, height: 32, data: vec![0; 3 * 32 * 32] });
+        let view = MaskedView { camera: &camera, image: &image, mask: None };
+        let (mut renderer, raster) = (Renderer::default(), RasterOptions::default());
+        let both = splats(&[[0.0, 4.0], [90.0, 0.1]]);
+        let [seen, beside] = shares(&both, &[view; 3], &raster, &mut renderer)[..] else {
+            panic!("two parents")
+        };
+        let alpha = renderer.render(&both, &camera, &raster).alpha;
+        let mean = alpha.iter().sum::<f32>() / alpha.len() as f32;
+        assert!(mean > 0.7 && (seen - 2.0 * mean).abs() < 1e-3, "{seen} {mean}");
+        assert_eq!(beside, 0.0);
+        let keep = |views: usize, least: f32, renderer: &mut Renderer| {
+            shown(&both, &vec![view; views], &raster, least, renderer)
+        };
+        assert_eq!(keep(3, 0.3, &mut renderer), Some(vec![true, false]));
+        assert_eq!(keep(2, 0.3, &mut renderer), None);
+        assert_eq!(keep(3, 0.0, &mut renderer), None);
+        // Half of the pixels are masked, and half of the weight is left: the share stays.
+        let mask: Vec<bool> = (0..32 * 32).map(|i| i % 32 < 16).collect();
+        let mask = crate::scene::mask::Mask::new(32, 32, mask).unwrap();
+        let half = MaskedView { mask: Some(&mask), ..view };
+        let masked = shares(&both, &[half], &raster, &mut renderer)[0];
+        assert!((masked - seen).abs() < 0.01 * seen, "{masked} {seen}");
+    }
+
+    #[test]
+    fn groups_and_families_are_whole() {
+        let four = splats(&[[0.0, 1.0], [1.0, 1.0], [2.0, 1.0], [3.0, 1.0]]);
+        assert_eq!(Groups::equal(&four, 2, true).ranges, [0..2, 2..4]);
+        assert!(Groups::equal(&four, 2, true).equal_families);
+        for (views, grouped) in [(3, true), (0, true), (2, false)] {
+            let none = Groups::equal(&four, views, grouped);
+            assert!(none.ranges.is_empty() && !none.equal_families);
+        }
+        let kept = families(&four, &[true, false, false, true]);
+        assert_eq!(kept.means().map(|m| m[0]).collect::<Vec<_>>(), [0.0, 3.0]);
+        assert_eq!((kept.sh().len(), kept.parents()), (6, 2));
+    }
+
+    /// Of each group the hidden parents go, and the ranges follow.
+    #[test]
+    fn ranges_follow_what_is_removed() {
+        let (camera, image) = (camera(), Rgb { width: 32, height: 32, data: vec![0; 3 * 32 * 32] });
+        let view = MaskedView { camera: &camera, image: &image, mask: None };
+        let all =
+            splats(&[[90.0, 0.1], [0.0, 0.5], [0.3, 0.5], [90.0, 0.1], [-0.3, 0.5], [0.1, 0.5]]);
+        let groups = Groups::equal(&all, 3, true);
+        let (mut renderer, raster) = (Renderer::default(), RasterOptions::default());
+        let mut go =
+            |groups: &Groups| pruned(&all, groups, &[view; 3], &raster, 0.05, &mut renderer);
+        let (kept, kept_groups) = go(&groups).unwrap();
+        assert_eq!((kept.len(), kept_groups.equal_families), (4, true));
+        assert_eq!(kept_groups.ranges, [0..1, 1..2, 2..4]);
+        assert!(go(&Groups { equal_families: false, ..groups }).is_none());
+    }
+}

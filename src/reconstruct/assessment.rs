@@ -311,6 +311,11 @@ mod tests {
         let noise = |i: usize| 1.0 + (i * 7919 % 101) as f32 / 50.0;
         let noisy = agreement_at([&noise, &noise]);
         assert!(noisy.consistent < 0.3 && noisy.gain() < truth.gain() - 10.0, "{noisy:?}");
+        // A point returns 0.5 % of the width from its pixel, 0.32 px, where the other surface changes the disparity
+        // 0.3·f/z by as much.
+        let other = |share: f32| 1.0 / (0.5 + share * 0.32 / (0.3 * camera(0.0).intrinsics().fx));
+        let consistent = |share| agreement_at([&plane, &|_| other(share)]).consistent;
+        assert_eq!([0.98, 1.02].map(consistent), [1.0, 0.0]);
         // No surface at all.
         let none = agreement_at([&|_| 0.0, &|_| 0.0]);
         assert_eq!(none, Agreement::default());

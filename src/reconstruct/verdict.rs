@@ -198,4 +198,29 @@ mod tests {
         // A scene that no photograph shares with another one has no agreement at all.
         assert_eq!(judge(&Agreement::default(), 0.0, &[]).trust, wrong);
     }
+
+    /// Each threshold by cases 2 % below and above it and, where a number has no rounding, at it. The thresholds
+    /// stand here as numbers, so that a change of a constant is seen.
+    #[test]
+    fn thresholds_are_where_the_table_was_measured() {
+        let (wrong, near, good) = (Trust::Wrong, Trust::NearPhotographs, Trust::Good);
+        let poses = [report("poses_wrong")];
+        let of = |agreement: &Agreement, coverage: f64, reports: &[PairReport]| {
+            SceneVerdict::new(agreement, coverage, reports).trust
+        };
+        let agreeing = |consistent, gain, reports: &[PairReport]| {
+            of(&agreement(consistent, gain), 0.95, reports)
+        };
+        let by = |f: &dyn Fn(f64) -> Trust, at: f64| [0.98 * at, at, 1.02 * at].map(f);
+        assert_eq!(by(&|v| agreeing(v, 8.0, &[]), 0.4), [near, good, good]);
+        assert_eq!(by(&|v| agreeing(0.7, v, &[]), 5.0), [near, good, good]);
+        assert_eq!(by(&|v| agreeing(v, 8.0, &[]), 0.15), [wrong, near, near]);
+        assert_eq!(by(&|v| agreeing(v, 8.0, &poses), 0.3), [wrong, near, near]);
+        assert_eq!(by(&|v| agreeing(0.7, v, &poses), 3.0), [wrong, near, near]);
+        let shared = |shared| of(&Agreement { shared, ..agreement(0.7, 8.0) }, 0.95, &[]);
+        assert_eq!(by(&shared, 0.2), [wrong, good, good]);
+        let parallax = |parallax| of(&Agreement { parallax, ..agreement(0.7, 8.0) }, 0.95, &[]);
+        assert_eq!(by(&parallax, 0.04), [near, good, good]);
+        assert_eq!(by(&|v| of(&agreement(0.7, 8.0), v, &[]), 0.85), [near, good, good]);
+    }
 }

@@ -323,6 +323,15 @@ mod tests {
         }
     }
 
+    /// One window by hand, with the constants as numbers: a change of either by 3 % is more than the tolerance.
+    #[test]
+    fn ssim_of_one_window_by_hand() {
+        // Means 0.2 and 0.6, both variances 0.01, covariance 0.005; 121/120 times as much for the sample.
+        // Luminance (0.24 + 0.0001) / (0.40 + 0.0001), structure (0.0100833 + 0.0009) / (0.0201667 + 0.0009).
+        let moments = [0.2, 0.6, 0.04 + 0.01, 0.36 + 0.01, 0.12 + 0.005];
+        assert!((ssim_at(moments) - 0.312868578741).abs() < 1e-9, "{}", ssim_at(moments));
+    }
+
     #[test]
     fn the_mean_gradient_of_a_ramp_is_its_slope() {
         // 0.01 a column and 0.02 a row, clipped nowhere; 12·9 and 13·8 neighbours.

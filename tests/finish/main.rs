@@ -2,5 +2,6 @@
 
 mod fit;
 mod loss;
+mod properties;
 mod reduce;
 mod refine;

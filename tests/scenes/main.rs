@@ -10,6 +10,7 @@ mod metrics;
 mod navigation;
 mod options;
 mod photographs;
+mod properties;
 mod resize;
 mod scene_formats;
 mod scenes;

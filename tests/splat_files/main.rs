@@ -3,6 +3,7 @@
 mod foreign;
 mod hostile_splats;
 mod left_out;
+mod properties;
 mod sog;
 mod splat_files;
 mod splat_fixtures;

@@ -243,9 +243,10 @@ fn garden_points_survive_a_ply() {
 }
 
 /// Names and types of a vertex, and how to encode a row of f64.
-struct Dialect {
-    format: &'static str,
-    types: Vec<(&'static str, String)>,
+#[derive(Clone, Debug)]
+pub(crate) struct Dialect {
+    pub(crate) format: &'static str,
+    pub(crate) types: Vec<(&'static str, String)>,
 }
 
 impl Dialect {
@@ -269,7 +270,12 @@ impl Dialect {
     }
 
     /// A file with extra elements before and after, lists included.
-    fn file(&self, newline: &str, rows: usize, value: impl Fn(usize, &str) -> f64) -> Vec<u8> {
+    pub(crate) fn file(
+        &self,
+        newline: &str,
+        rows: usize,
+        value: impl Fn(usize, &str) -> f64,
+    ) -> Vec<u8> {
         let mut head = vec![
             "ply".to_owned(),
             format!("format {} 1.0", self.format),
@@ -312,7 +318,7 @@ impl Dialect {
 }
 
 /// A number for every property of every Gaussian, exact in f32.
-fn number(i: usize, name: &str) -> f64 {
+pub(crate) fn number(i: usize, name: &str) -> f64 {
     let seed =
         name.bytes().fold(i as u64 * 1000, |h, b| h.wrapping_mul(31).wrapping_add(u64::from(b)));
     match name {
@@ -362,7 +368,7 @@ fn every_dialect_of_ply_reads_the_same() {
     assert_eq!(files, 3 * 5 * 2 * 4);
 }
 
-fn check_dialect(s: &Splats, i: usize, rests: usize, colours: [&str; 3]) {
+pub(crate) fn check_dialect(s: &Splats, i: usize, rests: usize, colours: [&str; 3]) {
     for (c, axis) in ["x", "y", "z"].into_iter().enumerate() {
         assert_eq!(f64::from(s.mean(i)[c]), number(i, axis));
         let log = number(i, &format!("scale_{c}"));

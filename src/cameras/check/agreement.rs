@@ -130,3 +130,77 @@ fn better_readings(work: &WorkingPair, chosen: &[Match], given: &Fit) -> Vec<(f6
     }
     Vec::new()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::CheckOptions;
+    use super::*;
+    use crate::cameras::matches::GrayImage;
+    use glam::{DVec2, Mat4, Quat, Vec3};
+    use subsplat_kernels::camera::{Camera, Intrinsics};
+
+    const SIZE: [usize; 2] = [640, 480];
+
+    fn camera(x: f32, turn: f32) -> Camera {
+        let pose = Mat4::from_rotation_translation(Quat::from_rotation_y(turn), Vec3::X * x);
+        Camera::new(Intrinsics::from_fov_x(1.0, SIZE[0], SIZE[1]), pose).unwrap()
+    }
+
+    /// Photographs of 640 px, of which a working pixel is a reported one.
+    fn work(cameras: [Camera; 2]) -> WorkingPair {
+        let grey = GrayImage::new(SIZE[0], SIZE[1], vec![0.5; SIZE[0] * SIZE[1]]).unwrap();
+        WorkingPair::new([&grey, &grey], cameras, &CheckOptions::default())
+    }
+
+    /// Each threshold by cases 2 % below and above it, as numbers.
+    #[test]
+    fn accuracy_has_the_measured_thresholds() {
+        let work = work([camera(0.0, 0.0), camera(0.3, 0.1)]);
+        let of = |distance: f64, in_front: f64| {
+            Agreement::new(&work, &[], &Fit { error: distance, distance, in_front }).accuracy
+        };
+        let by = |at: f64| [0.98, 1.02].map(|part| of(part * at, 1.0));
+        assert_eq!(by(1.5), [Accuracy::Precise, Accuracy::Imprecise]);
+        assert_eq!(by(4.0), [Accuracy::Imprecise, Accuracy::Wrong]);
+        let front = [0.98, 1.02].map(|part| of(0.5, part * 0.7));
+        assert_eq!(front, [Accuracy::Wrong, Accuracy::Precise]);
+    }
+
+    #[test]
+    fn a_mistaken_focal_length_is_off_by_more_than_a_calibration() {
+        let cameras = [camera(0.0, 0.0), camera(0.3, 0.1)];
+        let reading = |rank: u8, factor: Option<f32>| {
+            let (name, clause) = (String::new(), String::new());
+            is_mistake(&Reading { name, clause, rank, factor, cameras })
+        };
+        let factors = [0.98 * 1.15, 1.02 * 1.15, 1.0 / (0.98 * 1.15), 1.0 / (1.02 * 1.15)];
+        assert_eq!(factors.map(|f| reading(1, Some(f))), [false, true, false, true]);
+        assert!(reading(0, None) && !reading(2, None));
+    }
+
+    /// Cameras with OpenGL's axes, and matches of the true ones that are off by half a pixel: the reading is better
+    /// than the cameras as given if its error is below 0.3 of theirs.
+    #[test]
+    fn a_reading_is_reported_where_it_is_clearly_better() {
+        let truth = [camera(0.0, 0.0), camera(0.3, 0.1)];
+        let opengl = Mat4::from_scale(Vec3::new(1.0, -1.0, -1.0));
+        let given = truth.map(|c| c.with_pose_unchecked(c.world_from_camera() * opengl));
+        let place = |c: &Camera, p: Vec3| c.project(p).unwrap().as_dvec2();
+        let one = |i: usize| {
+            let at = |k: usize| (i * k % 61) as f32 / 61.0 - 0.5;
+            let point = Vec3::new(2.0 * at(7), 1.5 * at(11), 3.0 + 2.0 * at(23));
+            let off = DVec2::Y * if i.is_multiple_of(2) { 0.5 } else { -0.5 };
+            Match { a: place(&truth[0], point), b: place(&truth[1], point) + off }
+        };
+        let matches: Vec<Match> = (0..60).map(one).collect();
+        let work = work(given);
+        let better = |error: f64| {
+            let fit = Fit { error, distance: error, in_front: 1.0 };
+            better_readings(&work, &matches, &fit)
+        };
+        let (error, reading) = better(f64::INFINITY).swap_remove(0);
+        assert!(reading.rank == 0 && error > 0.2, "{} {error}", reading.name);
+        assert!(better(error / (0.98 * 0.3)).iter().any(|(_, r)| r.name == reading.name));
+        assert!(better(error / (1.02 * 0.3)).is_empty());
+    }
+}

@@ -262,6 +262,41 @@ mod tests {
         assert_eq!(imprecise, ["poses_imprecise"]);
     }
 
+    /// Each threshold by cases 2 % below and above it. The thresholds stand here as numbers, so that a change of a
+    /// constant is seen.
+    #[test]
+    fn thresholds_are_where_they_were_measured() {
+        let by = |change: &dyn Fn(&mut Measures, f32), at: f32| {
+            [0.98, 1.02].map(|part| codes(|m| change(m, part * at)).join(" "))
+        };
+        let overlap = |m: &mut Measures, v: f32| m.overlap = Some([0.8, v]);
+        assert_eq!(by(&overlap, 0.4), ["little_overlap", ""]);
+        assert_eq!(by(&overlap, 0.05), ["no_overlap", "little_overlap"]);
+        assert_eq!(by(&|m, v| m.coverage[0] = v, 0.3), ["little_coverage", ""]);
+        assert_eq!(by(&|m, v| m.brightness_difference = v, 0.12), ["", "brightness"]);
+        let depths = |m: &mut Measures, change: &dyn Fn(&mut DepthMeasures)| {
+            m.depths.iter_mut().for_each(change);
+        };
+        let ratio = |m: &mut Measures, v: f32| {
+            depths(m, &|d| d.report.iter_mut().for_each(|r| r.baseline_over_depth = v));
+        };
+        assert_eq!(by(&ratio, 1.2), ["", "large_baseline"]);
+        let shifts = |m: &mut Measures, v: f32| {
+            depths(m, &|d| (d.parallax_px, d.parallax_beyond_rotation_px) = (v, v));
+        };
+        assert_eq!(by(&shifts, 4.0), ["small_baseline", ""]);
+        // Small shifts, and larger ones beside another rotation: the lines are those of a wrong rotation.
+        let lines = |m: &mut Measures, own: f32, median: f32| {
+            depths(m, &|d| d.parallax_px = 3.0);
+            let lines = |e: &mut EpipolarReport| {
+                (e.own_median_px, e.median_px) = (own, Some(median));
+            };
+            m.epipolar.iter_mut().for_each(lines);
+        };
+        assert_eq!(by(&|m, v| lines(m, 0.4, v), 0.8), ["", "rotation_doubtful"]);
+        assert_eq!(by(&|m, v| lines(m, 0.1, v), 0.5), ["", "rotation_doubtful"]);
+    }
+
     #[test]
     fn the_sentence_on_wrong_poses_names_the_reason() {
         let sentence = |error_px, in_front| {

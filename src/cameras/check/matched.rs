@@ -105,3 +105,27 @@ impl Matched {
         n >= MIN_EVIDENCE && n as f64 >= MIN_EVIDENCE_SHARE * self.matches.len() as f64
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 16 matches, and a quarter of all.
+    #[test]
+    fn evidence_is_a_number_and_a_share_of_matches() {
+        let enough = |consistent: usize, matches: usize| {
+            let matched = Matched {
+                features: [matches; 2],
+                matches: vec![Match { a: DVec2::ZERO, b: DVec2::ZERO }; matches],
+                consistent: (0..consistent).collect(),
+                camera_inliers: 0,
+                estimated_distance: 0.0,
+                estimated_inliers: 0,
+            };
+            assert_eq!(matched.consistent_matches().len(), consistent);
+            matched.is_sufficient()
+        };
+        assert_eq!([enough(15, 20), enough(16, 20)], [false, true]);
+        assert_eq!([enough(249, 1000), enough(250, 1000)], [false, true]);
+    }
+}

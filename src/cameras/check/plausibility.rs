@@ -116,3 +116,66 @@ pub(super) fn same_photograph(a: &GrayImage, b: &GrayImage) -> Option<Finding> {
         Finding::new(Verdict::Bad, "same_photograph", sentence)
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Code and severity of a finding.
+    fn code(finding: Option<Finding>) -> Option<(String, Verdict)> {
+        finding.map(|f| (f.code, f.severity))
+    }
+
+    /// Each threshold by cases 2 % below and above it, as numbers.
+    #[test]
+    fn thresholds_are_those_of_lenses_and_video() {
+        let lens = Intrinsics::from_fov_x(1.0, 1000, 1000);
+        let found = |k: Intrinsics| code(intrinsics("first", &k)).map(|(code, _)| code);
+        let of = |change: &dyn Fn(&mut Intrinsics, f32), at: f32| {
+            [0.98, 1.02].map(|part| {
+                let mut k = lens;
+                change(&mut k, part * at);
+                found(k).unwrap_or_default()
+            })
+        };
+        assert_eq!(found(lens), None);
+        let fov = |k: &mut Intrinsics, degrees: f32| {
+            *k = Intrinsics::from_fov_x(degrees.to_radians(), 1000, 1000);
+        };
+        assert_eq!(of(&fov, 8.0), ["field_of_view", ""]);
+        assert_eq!(of(&fov, 140.0), ["", "field_of_view"]);
+        let middle = |k: &mut Intrinsics, share: f32| k.cx = 1000.0 * share;
+        assert_eq!(of(&middle, 0.28), ["principal_point", ""]);
+        assert_eq!(of(&middle, 0.72), ["", "principal_point"]);
+        let pixels = |k: &mut Intrinsics, ratio: f32| k.fx = ratio * k.fy;
+        assert_eq!(of(&pixels, 0.7), ["pixels_not_square", ""]);
+        assert_eq!(of(&pixels, 1.43), ["", "pixels_not_square"]);
+        let normalised = |k: &mut Intrinsics, focal: f32| (k.fx, k.fy) = (focal, focal);
+        assert_eq!(of(&normalised, 10.0), ["intrinsics_normalised", "field_of_view"]);
+    }
+
+    #[test]
+    fn a_photograph_of_another_shape_is_bad() {
+        let image = GrayImage::new(100, 100, vec![0.5; 10_000]).unwrap();
+        let judge = |width: usize, height: usize| {
+            let k = Intrinsics { width, height, ..Intrinsics::from_fov_x(1.0, 100, 100) };
+            code(size("first", &image, &k)).map(|(_, severity)| severity)
+        };
+        assert_eq!(judge(100, 100), None);
+        assert_eq!(judge(10_000, 10_196), Some(Verdict::Warning));
+        assert_eq!(judge(10_000, 10_204), Some(Verdict::Bad));
+        let wide = GrayImage::new(200, 100, vec![0.5; 20_000]).unwrap();
+        let k = Intrinsics { width: 100, height: 200, ..Intrinsics::from_fov_x(1.0, 100, 100) };
+        let turned = size("first", &wide, &k).unwrap();
+        assert!(turned.severity == Verdict::Bad && turned.sentence.contains("rotated"));
+    }
+
+    #[test]
+    fn copies_differ_by_less_than_recompression() {
+        let grey = |v: f32, side: usize| GrayImage::new(side, side, vec![v; side * side]).unwrap();
+        let same =
+            |difference: f32| same_photograph(&grey(0.5, 9), &grey(0.5 + difference, 9)).is_some();
+        assert_eq!([same(0.98 * 0.004), same(1.02 * 0.004)], [true, false]);
+        assert!(same_photograph(&grey(0.5, 9), &grey(0.5, 8)).is_none());
+    }
+}

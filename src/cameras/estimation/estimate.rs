@@ -578,3 +578,6 @@ fn written(
     let error_px = error / observations.len().max(1) as f32;
     PosePoint { position, colour, observations, error_px }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,8 +1,4 @@
-//! Any bytes as Bundler's cameras: an answer or an error, never a panic, never more memory than a few times the input.
+//! The target `bundler` of `subsplat_fuzz::targets`.
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
-
-fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::poses::bundler::parse("fuzz", bytes);
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("bundler", bytes));

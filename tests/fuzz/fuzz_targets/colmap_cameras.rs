@@ -1,9 +1,4 @@
-//! Any bytes as COLMAP's binary cameras file: an answer or an error, never a panic, never
-//! more memory than a few times the input.
+//! The target `colmap_cameras` of `subsplat_fuzz::targets`.
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
-
-fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::poses::colmap::parse_cameras_bin("fuzz", bytes);
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("colmap_cameras", bytes));

@@ -1,6 +1,4 @@
-//! `subsplat::files::photos::image::parse_depth_png` on arbitrary bytes: an answer, never a panic.
+//! The target `depth_png` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::photos::image::parse_depth_png(bytes, 0.001, "fuzz.png");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("depth_png", bytes));

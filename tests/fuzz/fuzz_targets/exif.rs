@@ -1,6 +1,4 @@
-//! `subsplat::files::photos::exif::parse_exif` on arbitrary bytes: an answer, never a panic.
+//! The target `exif` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::photos::exif::parse_exif(bytes, 4000, 3000);
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("exif", bytes));

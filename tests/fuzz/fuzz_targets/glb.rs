@@ -1,6 +1,4 @@
-//! `subsplat::files::splats::glb::parse_glb` on arbitrary bytes: an answer, never a panic.
+//! The target `glb` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::splats::glb::parse_glb(bytes, "fuzz.glb");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("glb", bytes));

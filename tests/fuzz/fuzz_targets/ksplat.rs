@@ -1,6 +1,4 @@
-//! `subsplat::files::splats::ksplat::parse_ksplat` on arbitrary bytes: an answer, never a panic.
+//! The target `ksplat` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::splats::ksplat::parse_ksplat(bytes, "fuzz.ksplat");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("ksplat", bytes));

@@ -1,6 +1,4 @@
-//! `subsplat::files::photos::image::parse_picture` on arbitrary bytes: an answer, never a panic.
+//! The target `picture` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::photos::image::parse_picture(bytes, "fuzz.png");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("picture", bytes));

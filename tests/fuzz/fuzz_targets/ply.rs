@@ -1,6 +1,4 @@
-//! `subsplat::files::splats::ply::parse_ply` on arbitrary bytes: an answer, never a panic.
+//! The target `ply` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::splats::ply::parse_ply(bytes, "fuzz.ply");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("ply", bytes));

@@ -1,8 +1,4 @@
-//! Any bytes as RealityCapture's table of cameras: an answer or an error, never a panic, never more memory than a few times the input.
+//! The target `reality_capture` of `subsplat_fuzz::targets`.
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
-
-fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::poses::reality_capture::parse("fuzz", bytes);
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("reality_capture", bytes));

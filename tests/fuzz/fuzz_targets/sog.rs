@@ -1,6 +1,4 @@
-//! `subsplat::files::splats::sog::parse_sog` on arbitrary bytes: an answer, never a panic.
+//! The target `sog` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::splats::sog::parse_sog(bytes, "fuzz.sog");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("sog", bytes));

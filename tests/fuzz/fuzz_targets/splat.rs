@@ -1,6 +1,4 @@
-//! `subsplat::files::splats::splat::parse_splat` on arbitrary bytes: an answer, never a panic.
+//! The target `splat` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::splats::splat::parse_splat(bytes, "fuzz.splat");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("splat", bytes));

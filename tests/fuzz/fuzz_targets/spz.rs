@@ -1,6 +1,4 @@
-//! `subsplat::files::splats::spz::parse_spz` on arbitrary bytes: an answer, never a panic.
+//! The target `spz` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::splats::spz::parse_spz(bytes, "fuzz.spz");
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("spz", bytes));

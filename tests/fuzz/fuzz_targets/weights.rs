@@ -1,6 +1,4 @@
-//! `subsplat::network::model::weights::parse_tensors` on arbitrary bytes: an answer, never a panic.
+//! The target `weights` of `subsplat_fuzz::targets`.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::network::model::weights::parse_tensors(bytes, std::path::Path::new("fuzz.safetensors"));
-});
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("weights", bytes));

@@ -1,0 +1,117 @@
+//! Thresholds of refusals and warnings, each by cases 2 % below and above it. They stand here as numbers, so that a
+//! change of a constant is seen.
+
+use super::*;
+use crate::cameras::estimation::photo::Lens;
+use crate::cameras::estimation::refine::Refined;
+use crate::cameras::estimation::two_view::Relative;
+use glam::DVec2;
+use nalgebra::SMatrix;
+
+/// A photograph of 640 px with a focal length of 640 px: a distance on the plane z = 1 is 640 px.
+fn photo(deviation: f64) -> PosePhoto {
+    let intrinsics = Intrinsics { fx: 640.0, fy: 640.0, cx: 320.0, cy: 2.0, width: 640, height: 4 };
+    PosePhoto::from_rgb8(&[128; 3 * 640 * 4], Lens { intrinsics, deviation }, 10).unwrap()
+}
+
+/// Points on two rings, of which a step forward moves the outer ones by `px`; no rotation explains any of it.
+fn forward(px: f64) -> Vec<Bearings> {
+    let ring = |radius: f64| {
+        (0..20).map(move |i| {
+            let a = radius * DVec2::from_angle(std::f64::consts::TAU * f64::from(i) / 20.0);
+            let b = a * (1.0 + px / 640.0 / 0.2);
+            Bearings { a, b, deviation: 1e-3, views: None }
+        })
+    };
+    ring(0.1).chain(ring(0.2)).collect()
+}
+
+fn estimate(consistent: usize, matches: usize, rival: f64) -> PairEstimate {
+    let relative = Relative { rotation: DMat3::IDENTITY, translation: -DVec3::Z };
+    let refined = Refined { relative, focal_scale: 1.0, information: SMatrix::identity() * 1e9 };
+    let points = forward(20.0);
+    PairEstimate {
+        refined,
+        inliers: Vec::new(),
+        points,
+        matches,
+        consistent,
+        free_focal: false,
+        rival,
+    }
+}
+
+#[test]
+fn few_matches_are_refused_by_number_and_by_share() {
+    let a = photo(0.0);
+    let found = |consistent, matches| refusal(&a, &estimate(consistent, matches, 0.0));
+    assert_eq!(
+        found(14, 20),
+        Some(PoseRefusal::FewMatches { consistent: 14, matches: 20, needed: 15 })
+    );
+    assert_eq!(found(15, 20), None);
+    let few = PoseRefusal::FewMatches { consistent: 199, matches: 1000, needed: 200 };
+    assert_eq!([found(199, 1000), found(200, 1000)], [Some(few), None]);
+}
+
+#[test]
+fn an_equal_rival_is_refused() {
+    let a = photo(0.0);
+    assert_eq!(refusal(&a, &estimate(100, 200, 0.98)), None);
+    let rival = refusal(&a, &estimate(100, 200, 0.99));
+    assert!(matches!(rival, Some(PoseRefusal::Ambiguous { percent }) if percent == 99.0));
+}
+
+#[test]
+fn views_of_one_place_are_refused() {
+    let a = photo(0.0);
+    assert!(matches!(
+        still(&a, &forward(0.98), 1.0),
+        Some(PoseRefusal::PureRotation { parallax_px, .. }) if (parallax_px - 0.98).abs() < 1e-3
+    ));
+    assert_eq!(still(&a, &forward(1.02), 1.0), None);
+    // All points move alike, as under a turn.
+    let aside = |px: f64| {
+        let moved = |m: Bearings| Bearings { b: m.a + DVec2::X * px / 640.0, ..m };
+        let points: Vec<Bearings> = forward(0.0).into_iter().map(moved).collect();
+        still(&a, &points, 1.0)
+    };
+    assert!(matches!(aside(0.49), Some(PoseRefusal::SameView { .. })));
+    assert!(matches!(aside(0.51), Some(PoseRefusal::PureRotation { .. })));
+}
+
+#[test]
+fn weak_pairs_have_warnings() {
+    let warnings = |consistent: usize, rival: f64, deviation: f64| {
+        let (a, b) = (photo(deviation), photo(0.0));
+        let found = judged(&a, &b, Ok(estimate(consistent, 50, rival)), &PoseOptions::default());
+        found.unwrap().warnings
+    };
+    assert_eq!(warnings(45, 0.98 * 0.85, 0.98 * 0.1), []);
+    assert_eq!(warnings(44, 0.0, 0.0), [PoseWarning::FewPoints { count: 44 }]);
+    assert!(matches!(warnings(45, 1.02 * 0.85, 0.0)[..], [PoseWarning::Rival { .. }]));
+    assert!(matches!(warnings(45, 0.0, 1.02 * 0.1)[..], [PoseWarning::FocalOfTwo { .. }]));
+}
+
+#[test]
+fn uncertain_cameras_have_warnings() {
+    let a = photo(0.0);
+    let warnings = |focal_deviation: f64, degrees: f64| {
+        let model = Model {
+            cameras: vec![Some(Absolute::IDENTITY); 2],
+            points: Vec::new(),
+            focal_scale: 1.0,
+            focal_deviation,
+            rotation_deviation: 0.0,
+            position_deviation: degrees.to_radians(),
+        };
+        finished(&[&a, &a], model, Vec::new(), Vec::new())
+    };
+    let certain = warnings(0.98 * 0.12, 0.98 * 1.5);
+    assert_eq!((certain.warnings.len(), certain.confidence), (0, Confidence::High));
+    let focal = warnings(1.02 * 0.12, 0.0);
+    assert!(matches!(focal.warnings[..], [PoseWarning::UncertainFocal { .. }]));
+    assert_eq!(focal.confidence, Confidence::Low);
+    let direction = warnings(0.0, 1.02 * 1.5).warnings;
+    assert!(matches!(direction[..], [PoseWarning::UncertainDirection { .. }]));
+}

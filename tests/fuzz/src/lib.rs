@@ -1,0 +1,3 @@
+//! Readers and round trips as functions of bytes, for the fuzz targets.
+
+pub mod targets;

@@ -1,0 +1,63 @@
+//! The committed corpus of the fuzz targets (`tests/fuzz/corpus`) through the functions that the fuzzer calls: no panic,
+//! no wrong round trip, no slow input, without a nightly toolchain.
+
+#[path = "../fuzz/src/targets.rs"]
+mod targets;
+
+use std::collections::BTreeSet;
+use std::panic::catch_unwind;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Longest time of one input. The inputs are below 64 KiB, and the slowest takes a few milliseconds.
+const LIMIT: Duration = Duration::from_secs(2);
+
+fn fuzz() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fuzz")
+}
+
+/// Names in a folder without extension, sorted.
+fn stems(folder: &Path) -> BTreeSet<String> {
+    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    entries.map(|path| path.file_stem().unwrap().to_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn every_input_of_the_corpus_is_answered() {
+    let mut wrong = Vec::new();
+    for &(name, _) in targets::TARGETS {
+        let folder = fuzz().join("corpus").join(name);
+        let mut inputs: Vec<PathBuf> =
+            std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+        inputs.sort();
+        assert!(!inputs.is_empty(), "{name}: no input");
+        for input in inputs {
+            let bytes = std::fs::read(&input).unwrap();
+            let start = Instant::now();
+            let answered = catch_unwind(|| targets::call(name, &bytes)).is_ok();
+            let time = start.elapsed();
+            if !answered || time > LIMIT {
+                wrong.push(format!("{}: answered {answered}, {time:?}", input.display()));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// A target without its program would not be fuzzed; a corpus without its target would not be read.
+#[test]
+fn targets_programs_and_corpora_have_the_same_names() {
+    let names: BTreeSet<String> =
+        targets::TARGETS.iter().map(|(name, _)| (*name).to_owned()).collect();
+    assert_eq!(names.len(), targets::TARGETS.len());
+    assert_eq!(stems(&fuzz().join("fuzz_targets")), names);
+    assert_eq!(stems(&fuzz().join("corpus")), names);
+    let manifest = std::fs::read_to_string(fuzz().join("Cargo.toml")).unwrap();
+    for name in &names {
+        assert!(manifest.contains(&format!("name = \"{name}\"")), "{name} is not in Cargo.toml");
+    }
+    let readme = std::fs::read_to_string(fuzz().join("README.md")).unwrap();
+    names.iter().for_each(|name| {
+        assert!(readme.contains(&format!("`{name}`")), "{name} is not in the README")
+    });
+}
