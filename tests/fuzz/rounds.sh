@@ -24,9 +24,11 @@ trap 'rmdir "$target_path"' EXIT
 export RAYON_NUM_THREADS=1
 mkdir -p "$(dirname "$LOG")"
 for target; do
-    mkdir -p "$CORPUS/$target" "$failed/$target" "tests/fuzz/corpus/$target"
+    seeds=out/fuzz/seeds/$target
+    mkdir -p "$CORPUS/$target" "$failed/$target" "$seeds"
+    tests/fuzz/corpus.py unpack "$target" "$seeds"
     status=0
-    PATH=$target_path "$BIN/$target" "$CORPUS/$target" "tests/fuzz/corpus/$target" -max_total_time="$seconds" -timeout=10 \
+    PATH=$target_path "$BIN/$target" "$CORPUS/$target" "$seeds" -max_total_time="$seconds" -timeout=10 \
         -rss_limit_mb=3000 -max_len=16384 -report_slow_units=1 -print_final_stats=1 -print_funcs=0 \
         -artifact_prefix="$failed/$target/" >"$LOG.$target" 2>&1 || status=$?
     stat() { sed -n "s/^stat::$1: *//p" "$LOG.$target" | tail -1; }

@@ -5,6 +5,7 @@
 mod targets;
 
 use std::collections::BTreeSet;
+use std::io::{Cursor, Read};
 use std::panic::catch_unwind;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -26,18 +27,21 @@ fn stems(folder: &Path) -> BTreeSet<String> {
 fn every_input_of_the_corpus_is_answered() {
     let mut wrong = Vec::new();
     for &(name, _) in targets::TARGETS {
-        let folder = fuzz().join("corpus").join(name);
-        let mut inputs: Vec<PathBuf> =
-            std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
-        inputs.sort();
+        let archive = std::fs::read(fuzz().join(format!("corpus/{name}.zip"))).unwrap();
+        let mut inputs = zip::ZipArchive::new(Cursor::new(archive)).unwrap();
         assert!(!inputs.is_empty(), "{name}: no input");
-        for input in inputs {
-            let bytes = std::fs::read(&input).unwrap();
+        for i in 0..inputs.len() {
+            let mut input = inputs.by_index(i).unwrap();
+            let mut bytes = Vec::new();
+            input.read_to_end(&mut bytes).unwrap();
             let start = Instant::now();
             let answered = catch_unwind(|| targets::call(name, &bytes)).is_ok();
             let time = start.elapsed();
             if !answered || time > LIMIT {
-                wrong.push(format!("{}: answered {answered}, {time:?}", input.display()));
+                wrong.push(format!(
+                    "{name}, {}: answered {answered}, {time:?}",
+                    input.name().unwrap()
+                ));
             }
         }
     }
