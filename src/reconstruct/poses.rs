@@ -124,8 +124,8 @@ pub fn adjusted(photos: &[Photo]) -> Result<Option<(Vec<Photo>, PoseAdjustment)>
     Ok(Some((moved.collect::<Result<_>>()?, found)))
 }
 
-/// [`adjusted`] for cameras that the check `reports` doubts ([`doubted`]). `None` also with fewer than
-/// [`CERTAIN_POINTS`] points a photograph: a pair with 37 points in all lost 0.6 dB and 0.12 of SSIM in new views.
+/// [`adjusted`] for cameras that the check `reports` doubts. `None` also with fewer than a hundred points a
+/// photograph: a pair with 37 points in all lost 0.6 dB and 0.12 of SSIM in new views.
 ///
 /// # Errors
 /// Those of [`adjusted`].

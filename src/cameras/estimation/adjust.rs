@@ -23,9 +23,9 @@ const MAX_TURN_DEG: f64 = 4.0;
 const MAX_ERROR_SHARE: f64 = 0.8;
 /// Median error of cameras that fit, working px, where fewer than [`CERTAIN_POINTS`] tell.
 const FITTING_PX: f64 = 1.0;
-/// Points for each photograph that tell errors below [`FITTING_PX`]. Chosen on five photographs of eight
+/// Points for each photograph that tell median errors below a working pixel. Chosen on five photographs of eight
 /// scenes of `../shared/photos`, of which one has fewer points: 18.6 dB adjusted, 20.3 dB as given.
-pub(crate) const CERTAIN_POINTS: usize = 100;
+pub const CERTAIN_POINTS: usize = 100;
 
 /// Result of [`adjust_poses`].
 #[derive(Clone, Debug, PartialEq)]

@@ -31,8 +31,7 @@ mod two_view;
 mod views;
 mod world;
 
-pub(crate) use adjust::CERTAIN_POINTS;
-pub use adjust::{PoseAdjustment, adjust_poses, locate_photos, move_along};
+pub use adjust::{CERTAIN_POINTS, PoseAdjustment, adjust_poses, locate_photos, move_along};
 pub use estimate::{
     Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
     PoseWarning, Uncertain, estimate_poses,
