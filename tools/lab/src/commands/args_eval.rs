@@ -80,7 +80,7 @@ pub struct EvalArgs {
     /// at the inputs' cameras are then those of the disturbed inputs.
     #[arg(long, value_delimiter = ',', value_name = "D,…", value_parser = disturbance)]
     pub disturb: Vec<Disturbance>,
-    /// Adjust the inputs' cameras by points matched between them, as in `run`: auto, always, never. Targets are then
+    /// Adjust the inputs' cameras by points matched between them: never, auto (where `run` does), always. Targets are then
     /// located by points that they share with the inputs; without enough, they follow by one similarity.
     #[arg(
         long,
@@ -88,7 +88,7 @@ pub struct EvalArgs {
         value_enum,
         num_args = 0..=1,
         require_equals = true,
-        default_value = "auto",
+        default_value = "never",
         default_missing_value = "always"
     )]
     pub adjust_poses: AdjustPosesArg,

@@ -10,14 +10,20 @@ use subsplat_kernels::camera::Camera;
 
 /// Steps before the network. They receive the inputs' photographs and the cameras after all
 /// disturbances.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Preparation {
-    /// Cameras of the inputs. By default they are adjusted as `run` does. With adjusted ones, the targets are located by points matched with the
+    /// Cameras of the inputs. Default: those of the data, on which a protocol compares methods. With adjusted ones, the targets are located by points matched with the
     /// inputs, because a target's own camera is in the frame of the cameras before. Targets with too few
     /// matches follow the inputs by one similarity.
     pub poses: Poses,
     /// Gives all inputs the exposure and white balance of one of them; of two inputs it is the first.
     pub equal_exposure: bool,
+}
+
+impl Default for Preparation {
+    fn default() -> Self {
+        Self { poses: Poses::Given, equal_exposure: false }
+    }
 }
 
 impl Preparation {

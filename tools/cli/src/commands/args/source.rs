@@ -34,6 +34,7 @@ pub struct SourceArgs {
         default_missing_value = "always",
         hide_default_value = true,
         hide_possible_values = true,
+        hide_short_help = true,
         help_heading = CAMERAS
     )]
     pub adjust_poses: AdjustPosesArg,
