@@ -77,7 +77,7 @@ pub fn check_pairs(
 /// Median distance of a pair's points from the lines that its cameras predict, over that from their own lines, from
 /// which its cameras are adjusted. Consecutive photographs of five and nine of each scene of `../shared/photos`: six
 /// scenes have at most 1.3, the two of a headset and one clip up to 7. Adjusted, nine photographs of the headset's gain
-/// 1.2 dB in new views, five 0.8 dB.
+/// 1.2 dB in new views.
 const DOUBTED: f32 = 2.0;
 /// Accuracy of a match, px of a photograph of [`REPORT_SIDE`] or more: smaller distances from their own lines count
 /// as this.
