@@ -54,7 +54,8 @@ pub struct Options {
 }
 
 impl Options {
-    /// Sets [`Options::input_size`], [`Options::density`] and [`Options::refine`] by one level of quality. Setters that follow override single values.
+    /// Sets [`Options::input_size`], [`Options::density`] and [`Options::refine`] by one level of quality.
+    /// Setters that follow override single values.
     ///
     /// ```
     /// use subsplat::reconstruct::{InputSize, Options, Quality, Refine};
@@ -514,7 +515,7 @@ mod tests {
         assert_eq!([steps(few(), 3), steps(few().with_refine(Refine::Steps(30)), 3)], [4, 0]);
         assert_eq!(steps(few().with_refine(Refine::Off), 3), 4);
         assert_eq!(steps(few().with_refine(Refine::Seconds(60)), 3), 4);
-        // What was asked for stays.
+        // A fit that was asked for stays.
         let asked = |n: usize| Options::default().with_fit(FitOptions::default().with_steps(n));
         assert_eq!([steps(asked(7), 5), steps(asked(0), 2)], [7, 0]);
         // Without a fit that was asked for, the Gaussians stay the network's.

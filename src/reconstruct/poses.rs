@@ -1,7 +1,10 @@
 //! Check and adjustment of the poses by points matched between photographs.
 
 use super::{Error, Photo, Result};
-use crate::cameras::check::{CheckOptions, Finding, GrayImage, PairReport, Verdict, check_pair};
+use crate::cameras::check::{
+    CheckOptions, Finding, GrayImage, MATCH_PX, PairReport, REPORT_SIDE, Verdict, WORSE_THAN_OWN,
+    check_pair,
+};
 use crate::cameras::estimation::{
     CERTAIN_POINTS, Lens, PoseAdjustment, PosePhoto, adjust_poses, locate_photos,
 };
@@ -74,24 +77,16 @@ pub fn check_pairs(
     Ok(reports)
 }
 
-/// Median distance of a pair's points from the lines that its cameras predict, over that from their own lines, from
-/// which its cameras are adjusted. Consecutive photographs of five and nine of each scene of `../shared/photos`: six
-/// scenes have at most 1.3, the two of a headset and one clip up to 7. Adjusted, nine photographs of the headset's gain
-/// 1.2 dB in new views.
-const DOUBTED: f32 = 2.0;
-/// Accuracy of a match, px of a photograph of [`REPORT_SIDE`] or more: smaller distances from their own lines count
-/// as this.
-const MATCH_PX: f32 = 0.25;
-/// Longer side of the photographs to which a report's px refer, px.
-const REPORT_SIDE: f32 = 640.0;
-
-/// Returns whether points tell that cameras are nearly right, but not right: those of a pair lie [`DOUBTED`] times
-/// as far from the cameras' lines as from their own, and no pair's cameras are wrong.
+/// Returns whether points tell that cameras are nearly right, but not right: those of a pair lie [`WORSE_THAN_OWN`]
+/// times as far from the cameras' lines as from their own, and no pair's cameras are wrong.
+///
+/// Consecutive photographs of five and nine of each scene of `../shared/photos`: six scenes have at most 1.3 times, the
+/// two of a headset and one clip up to 7. Adjusted, nine photographs of the headset's gain 1.2 dB in new views.
 pub(super) fn doubted(photos: &[Photo], reports: &[PairReport]) -> bool {
     let side = |p: &Photo| p.size().width.max(p.size().height);
     let smallest = photos.iter().map(side).min().unwrap_or(0).max(1);
     // A match in a smaller photograph is less accurate in the px of a report.
-    doubts(reports, MATCH_PX * (REPORT_SIDE / smallest as f32).max(1.0))
+    doubts(reports, MATCH_PX * (REPORT_SIDE as f32 / smallest as f32).max(1.0))
 }
 
 /// [`doubted`] where a match is accurate to `accuracy` px of a report.
@@ -100,7 +95,7 @@ fn doubts(reports: &[PairReport], accuracy: f32) -> bool {
     let far = |r: &PairReport| {
         let epipolar = r.epipolar.as_ref();
         epipolar.is_some_and(|e| {
-            e.median_px.is_some_and(|px| px >= DOUBTED * e.own_median_px.max(accuracy))
+            e.median_px.is_some_and(|px| px >= WORSE_THAN_OWN * e.own_median_px.max(accuracy))
         })
     };
     reports.iter().any(far) && !reports.iter().any(wrong)

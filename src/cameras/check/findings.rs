@@ -22,9 +22,9 @@ const MIN_PARALLAX: f32 = 4.0;
 /// Median distance of the matches to the cameras' epipolar lines over that to their own, above which
 /// the cameras are doubted. Good poses of real photographs: 1.0 to 1.3; a rotation that is wrong by
 /// 4 degrees and cancels the parallax: 4.
-const WORSE_THAN_OWN: f32 = 2.0;
+pub(crate) const WORSE_THAN_OWN: f32 = 2.0;
 /// Accuracy of a match, px at 640: smaller distances to the matches' own lines count as this.
-const MATCH_PX: f32 = 0.25;
+pub(crate) const MATCH_PX: f32 = 0.25;
 /// Baseline over median depth above which the two views of a surface differ too much to match.
 const MAX_BASELINE_OVER_DEPTH: f32 = 1.2;
 /// Difference of mean brightness (0 to 1) above which the exposures differ.

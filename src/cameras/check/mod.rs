@@ -33,10 +33,14 @@ mod report;
 mod working;
 
 pub use crate::cameras::matches::GrayImage;
+#[cfg(feature = "network")]
+pub(crate) use findings::{MATCH_PX, WORSE_THAN_OWN};
 pub use picture::{RgbPicture, epipolar_picture};
 pub use report::{
     DepthReport, EpipolarReport, Finding, MatchedPoint, PairReport, ReadingReport, Verdict,
 };
+#[cfg(feature = "network")]
+pub(crate) use working::REPORT_SIDE;
 
 use matched::Matched;
 use measures::{CameraMeasures, Measures};

@@ -6,7 +6,7 @@ use glam::DVec2;
 use subsplat_kernels::camera::Camera;
 
 /// Longer side of the photographs at which errors are reported, px.
-pub(super) const REPORT_SIDE: f64 = 640.0;
+pub(crate) const REPORT_SIDE: f64 = 640.0;
 /// A match agrees with an epipolar geometry within this many px at 640. The limit is three times
 /// the error of good poses of real photographs (0.3 to 0.6 measured).
 pub(super) const LIMIT_PX: f64 = 1.5;

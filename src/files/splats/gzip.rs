@@ -2,7 +2,7 @@
 //!
 //! Each part is compressed by itself and ends at a byte (an empty stored block of deflate, RFC 1951), so that the
 //! parts follow one another in one stream, as `pigz` writes it. Decoders see one member. The parts do not refer to
-//! one another: of 600 KB each, the stream is about 1 % longer. The number of threads does not change a byte.
+//! one another. The number of threads does not change a byte.
 
 use flate2::{Compress, Compression, Crc, FlushCompress};
 use rayon::prelude::*;

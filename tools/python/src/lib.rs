@@ -28,7 +28,7 @@ use pyo3::prelude::*;
 #[global_allocator]
 static PAGES: subsplat_cli::pages::Pages = subsplat_cli::pages::Pages;
 /// Free memory that stays for the next call, bytes. Python frees pictures and gradients late: without it each
-/// step of a training with PyTorch maps its gradients anew, a sixth of its time at 131,072 Gaussians.
+/// step of a training with PyTorch maps its gradients anew, a seventh of its time at 131,072 Gaussians.
 const KEPT_FREE: usize = 128 << 20;
 
 /// Functions and classes of the package `subsplat`, without its defaults.

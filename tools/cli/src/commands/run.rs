@@ -202,8 +202,7 @@ pub fn photographs(
     force: bool,
     progress: &mut Progress,
 ) -> Result<Vec<Photo>> {
-    let truncated = if force { Truncated::Accept } else { Truncated::Refuse };
-    let options = LoadOptions { truncated };
+    let options = load_options(force);
     let mut warnings: Vec<(&Path, Vec<String>)> = Vec::new();
     let photos = progress.steps("photographs", context.len(), |bar| {
         let photo = |&i: &usize| {
@@ -220,6 +219,11 @@ pub fn photographs(
         grouped(lines).iter().for_each(print_warning);
     }
     Ok(photos)
+}
+
+/// Options of the decoding; `force` accepts truncated files.
+fn load_options(force: bool) -> LoadOptions {
+    LoadOptions { truncated: if force { Truncated::Accept } else { Truncated::Refuse } }
 }
 
 /// Locates the frames `targets` among the photographs of the scene where the cameras of these were adjusted: those of
@@ -243,17 +247,17 @@ fn follow_adjustment(
     let adjusted: Vec<Camera> = result.inputs().iter().map(|c| c.input_camera).collect();
     let given = cameras(&targets);
     let mut moved = move_along(&cameras(&plan.context), &adjusted, &given).unwrap_or(given);
-    let posed = |photos: Vec<Photo>, cameras: &[Camera]| {
-        let pairs = photos.iter().zip(cameras);
-        pairs
-            .map(|(photo, to)| {
-                photo.with_camera(photo.camera().with_pose_unchecked(to.world_from_camera()))
-            })
-            .collect::<subsplat::Result<Vec<_>>>()
+    let options = load_options(force);
+    let posed = |of: &[usize], cameras: &[Camera]| {
+        let photo = |(&i, to): (&usize, &Camera)| {
+            let photo = Photo::from_frame_with(&frames[i], &options)?;
+            photo.with_camera(photo.camera().with_pose_unchecked(to.world_from_camera()))
+        };
+        of.iter().zip(cameras).map(photo).collect::<subsplat::Result<Vec<_>>>()
     };
-    let inputs = posed(photographs(&plan.scene, &plan.context, force, progress)?, &adjusted)?;
+    let inputs = posed(&plan.context, &adjusted)?;
     for (targets, moved) in targets.chunks(TOGETHER).zip(moved.chunks_mut(TOGETHER)) {
-        let photos = posed(photographs(&plan.scene, targets, force, progress)?, moved)?;
+        let photos = posed(targets, moved)?;
         let found = progress.stage("cameras", |_| located(&inputs, &photos))?;
         moved.iter_mut().zip(found).for_each(|(moved, found)| *moved = found.unwrap_or(*moved));
     }

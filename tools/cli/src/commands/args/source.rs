@@ -267,9 +267,9 @@ pub enum CropShapeArg {
 /// Correction of given cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum AdjustPosesArg {
-    /// Where the comparison of the photographs doubts them.
+    /// Of cameras that the comparison of the photographs doubts.
     Auto,
-    /// Wherever points of the photographs contradict them.
+    /// Of all cameras that points of the photographs contradict.
     Always,
     /// None.
     Never,
