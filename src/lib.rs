@@ -93,8 +93,8 @@ pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 pub use crate::reconstruct::{
     Check, Density, DepthBounds, DepthRange, Detail, Error, EstimateOptions, EstimatedPhotos,
     EstimatedScene, InputSize, KnownLens, LensSource, Matching, Options, Photo, Photographs, Poses,
-    Prepared, Progress, Quality, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize,
-    Warning, estimate_cameras, estimate_cameras_of_files,
+    Prepared, Progress, Quality, Reconstruction, Reconstructor, Refine, Result, Stage,
+    Surroundings, TargetSize, Warning, estimate_cameras, estimate_cameras_of_files,
 };
 pub use files::photos::image::{LoadOptions, save_depth_png, save_png};
 pub use files::photos::photograph::{Photograph, load_photograph, parse_photograph};

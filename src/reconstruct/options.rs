@@ -41,6 +41,8 @@ pub struct Options {
     pub matching: Matching,
     /// Source of colour detail. Default: [`Detail::Photographs`].
     pub detail: Detail,
+    /// Gaussians beyond the edges of the photographs. Default: [`Surroundings::Photographs`].
+    pub surroundings: Surroundings,
     /// Fit of the Gaussians to the photographs ([`crate::finish::fit()`]). Default: four steps where the refinement
     /// needs them ([`RefineOptions::needs_fit`]), else none.
     pub fit: Option<FitOptions>,
@@ -139,6 +141,13 @@ impl Options {
         self
     }
 
+    /// Sets [`Options::surroundings`].
+    #[must_use]
+    pub fn with_surroundings(mut self, surroundings: Surroundings) -> Self {
+        self.surroundings = surroundings;
+        self
+    }
+
     /// Sets [`Options::fit`]; [`FitOptions::off`] keeps the network's Gaussians, unless
     /// [`Options::refine`] names a number of steps.
     #[must_use]
@@ -188,10 +197,21 @@ impl Options {
         self.fit.unwrap_or_else(|| if needs() { FitOptions::default() } else { FitOptions::off() })
     }
 
-    /// Returns whether depth is matched: not where the Gaussians are to stay the network's.
+    /// Returns whether the Gaussians are to stay the network's.
+    fn keeps_the_networks(&self) -> bool {
+        !self.changes_sizes() && self.refine_options(2).steps == 0
+    }
+
+    /// Returns whether depth is matched.
     pub(super) fn matches_depth(&self) -> bool {
-        let stays = !self.changes_sizes() && self.refine_options(2).steps == 0;
-        self.matching == Matching::Photographs && !stays
+        self.matching == Matching::Photographs && !self.keeps_the_networks()
+    }
+
+    /// Returns whether Gaussians are added where no photograph shows the scene.
+    pub(super) fn has_surroundings(&self) -> bool {
+        let has_room = matches!(self.density, Density::Auto | Density::Full);
+        let wanted = self.surroundings == Surroundings::Photographs;
+        wanted && has_room && !self.keeps_the_networks()
     }
 
     /// Options of the refinement for a number of photographs.
@@ -469,6 +489,19 @@ pub enum Matching {
     #[default]
     Photographs,
     /// The network's own depth.
+    Off,
+}
+
+/// Gaussians beyond the edges of the photographs, so that new views from beside them have no strips of the
+/// background's colour.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Surroundings {
+    /// In the colours and depths of the pixels at the edges, about 1 % more Gaussians. None where the caller gives
+    /// their number ([`Options::density`]), or where neither [`Options::fit`] nor [`Options::refine`] changes them.
+    #[default]
+    Photographs,
+    /// None.
     Off,
 }
 

@@ -78,7 +78,7 @@ pub fn check_pairs(
 }
 
 /// Returns whether points tell that cameras are nearly right, but not right: those of a pair lie [`WORSE_THAN_OWN`]
-/// times as far from the cameras' lines as from their own, and no pair's cameras are wrong.
+/// times as far from the cameras' lines as from their own, and the cameras of fewer than half of the pairs are wrong.
 ///
 /// Consecutive photographs of five and nine of each scene of `../shared/photos`: six scenes have at most 1.3 times, the
 /// two of a headset and one clip up to 7. Adjusted, nine photographs of the headset's gain 1.2 dB in new views.
@@ -98,7 +98,8 @@ fn doubts(reports: &[PairReport], accuracy: f32) -> bool {
             e.median_px.is_some_and(|px| px >= WORSE_THAN_OWN * e.own_median_px.max(accuracy))
         })
     };
-    reports.iter().any(far) && !reports.iter().any(wrong)
+    let wrong = reports.iter().filter(|r| wrong(r)).count();
+    reports.iter().any(far) && 2 * wrong < reports.len()
 }
 
 /// Features of each photograph for the adjustment.
@@ -218,11 +219,12 @@ mod tests {
         assert!(!doubted(&[report(Some(0.3), 0.1)]) && doubted(&[report(Some(0.5), 0.1)]));
         assert!(!doubted(&[report(None, 0.3), PairReport::default()]) && !doubted(&[]));
         assert!(!doubts(&[report(Some(1.9), 0.3)], 1.0) && doubts(&[report(Some(2.1), 0.3)], 1.0));
-        // Wrong cameras are not nearly right.
+        // One of three pairs may be far off; cameras of which half of the pairs are wrong are not nearly right.
         let code = "poses_wrong".to_owned();
         let finding = Finding { severity: Verdict::Bad, code, sentence: String::new() };
         let wrong = PairReport { findings: vec![finding], ..report(Some(9.0), 0.3) };
-        assert!(!doubted(&[report(Some(2.0), 0.3), wrong]));
+        assert!(!doubted(&[report(Some(2.0), 0.3), wrong.clone()]));
+        assert!(doubted(&[report(Some(2.0), 0.3), fits, wrong]));
     }
 
     #[test]

@@ -4,8 +4,8 @@ use super::progress::Tracker;
 use super::unit;
 use super::{
     DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, SceneChildren,
-    Stage, Warning, counts_of, fit_to_inputs, match_parents, options_of_parents, refine_on_inputs,
-    refine_parents,
+    Stage, Warning, add_surroundings, counts_of, fit_to_inputs, match_parents, options_of_parents,
+    refine_on_inputs, refine_parents,
 };
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
@@ -183,6 +183,10 @@ impl Prepared<'_> {
                 refine_on_inputs(splats, groups, &inputs, raster, how, &mut renderer, &mut step)?;
             refinement = Some(done);
         }
+        let mut surroundings = 0;
+        if options.has_surroundings() {
+            surroundings = add_surroundings(&mut splats, &inputs, &raster_at(1.0), &mut renderer);
+        }
         warnings.extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
         let depths = inputs.iter().zip(distances);
         let mut depths: Vec<Depth> =
@@ -202,6 +206,7 @@ impl Prepared<'_> {
         warnings.extend(model.backend_warning());
         Ok(Reconstruction {
             splats,
+            surroundings,
             groups,
             counts: parent_counts,
             inputs,

@@ -1,6 +1,9 @@
 //! A reconstructed scene.
 
-use super::{DepthBounds, Detail, Refine, Result, StageTime, Warning, refine_on_inputs};
+use super::{
+    DepthBounds, Detail, Refine, Result, StageTime, Warning, add_surroundings, refine_on_inputs,
+    remove_surroundings,
+};
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
 use crate::files::{SaveOptions, SaveReport, save_splats};
@@ -19,6 +22,8 @@ use subsplat_kernels::layout::RasterOptions;
 #[derive(Clone, Debug)]
 pub struct Reconstruction {
     pub(super) splats: Splats,
+    /// The last of them, which lie where no photograph shows the scene.
+    pub(super) surroundings: usize,
     /// Gaussians of each photograph.
     pub(super) groups: Groups,
     /// K of each parent; empty where all have the same.
@@ -83,10 +88,17 @@ impl Reconstruction {
         renderer: &mut Renderer,
         progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
     ) -> Result<RefineReport> {
-        let Self { splats, groups, inputs, raster_options, fit, .. } = self;
+        let Self { splats, surroundings, groups, inputs, raster_options: raster, fit, .. } = self;
         let options = refine.options_for(inputs.len(), fit.is_some());
+        let mut bare = splats.clone();
+        remove_surroundings(&mut bare, *surroundings);
         let report =
-            refine_on_inputs(splats, groups, inputs, raster_options, &options, renderer, progress)?;
+            refine_on_inputs(&mut bare, groups, inputs, raster, &options, renderer, progress)?;
+        if *surroundings > 0 {
+            // The rules for pictures of the inputs' size differ in the low-pass alone, which is below a pixel.
+            *surroundings = add_surroundings(&mut bare, inputs, raster, renderer);
+        }
+        *splats = bare;
         self.refinement = Some(report);
         Ok(report)
     }

@@ -1,6 +1,6 @@
 //! The library's call with a progress bar and lines for the user: for `run` and `view`.
 
-use super::args::{CropShapeArg, DetailArg, MatchingArg, SourceArgs};
+use super::args::{CropShapeArg, DetailArg, MatchingArg, SourceArgs, SurroundingsArg};
 use super::memory::{self, Planned};
 use crate::pages;
 use crate::report::{Progress, print_line, print_warning, show_fraction};
@@ -16,7 +16,7 @@ use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, InputSize, Matching, Options, Photo, Poses, Prepared,
-    Quality, Reconstruction, Reconstructor, TargetSize, Warning,
+    Quality, Reconstruction, Reconstructor, Surroundings, TargetSize, Warning,
 };
 use subsplat_kernels::camera::Size;
 
@@ -31,6 +31,10 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         MatchingArg::Photo => Matching::Photographs,
         MatchingArg::Off => Matching::Off,
     };
+    let surroundings = match args.surroundings {
+        SurroundingsArg::Photo => Surroundings::Photographs,
+        SurroundingsArg::Off => Surroundings::Off,
+    };
     let detail = match args.detail {
         DetailArg::Photo => Detail::Photographs,
         DetailArg::Off => Detail::Off,
@@ -42,6 +46,7 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_depth_prior(DepthBounds::of_scene(scene, context)?)
         .with_check(check)
         .with_matching(matching)
+        .with_surroundings(surroundings)
         .with_detail(detail)
         .with_poses(args.adjust_poses.into());
     options.fit = args.fit.map(|steps| FitOptions::default().with_steps(steps));

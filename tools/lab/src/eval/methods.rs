@@ -21,6 +21,8 @@ pub enum Method {
     /// photographs of the input's size; their children with detail, fitted and refined
     /// ([`subsplat::finish::refine()`]).
     Refine,
+    /// [`Method::Refine`] without the Gaussians where no photograph shows the scene.
+    Bare,
     /// [`Method::Refine`] without the match of depths between the photographs.
     Unmatched,
     /// [`Method::Fit`], refined on the photographs: the parents stay as predicted.
@@ -62,11 +64,12 @@ pub enum Method {
 }
 
 /// Names of the methods that need no files, in the order of the tables.
-pub(crate) const NAMED: [(&str, Method); 17] = [
+pub(crate) const NAMED: [(&str, Method); 18] = [
     ("subsplat", Method::Subsplat),
     ("detail", Method::Detail),
     ("fit", Method::Fit),
     ("refine", Method::Refine),
+    ("bare", Method::Bare),
     ("unmatched", Method::Unmatched),
     ("direct", Method::Direct),
     ("pair", Method::Pair),

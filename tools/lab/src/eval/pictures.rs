@@ -14,8 +14,8 @@ use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::inputs::crop::{Cropped, PhotoWindow};
 use subsplat::reconstruct::stages::{
-    SceneChildren, counts_of, fit_to_inputs, match_parents, options_of_parents, refine_on_inputs,
-    refine_parents,
+    SceneChildren, add_surroundings, counts_of, fit_to_inputs, match_parents, options_of_parents,
+    refine_on_inputs, refine_parents, remove_surroundings,
 };
 use subsplat::reconstruct::{
     Density, DepthBounds, DepthRange, Error, Reconstructor, Refine, Result,
@@ -42,6 +42,8 @@ pub(super) struct PictureMaker<'a> {
     /// The set that `splats` holds.
     current: Option<Set>,
     splats: Option<SceneChildren>,
+    /// The last of them, which lie where no photograph shows the scene.
+    surroundings: usize,
     rasterizer: Rasterizer,
     /// Mean alpha of the last rendered picture.
     coverage: f64,
@@ -67,6 +69,8 @@ enum Set {
     Fitted,
     /// Refined children of parents that were prepared before.
     Refined(Parents),
+    /// [`Set::Refined`] of matched parents, without the surroundings.
+    Bare,
     /// The Gaussians of `run` for pictures of a smaller size.
     Smaller(Smaller),
     /// The Gaussians of `run` for two of the inputs.
@@ -143,6 +147,7 @@ impl Set {
             Method::Detail => Some(Self::Detailed),
             Method::Fit => Some(Self::Fitted),
             Method::Refine => Some(Self::Refined(Parents::Matched)),
+            Method::Bare => Some(Self::Bare),
             Method::Unmatched => Some(Self::Refined(Parents::Refined)),
             Method::Direct => Some(Self::Refined(Parents::Predicted)),
             Method::Enlarged | Method::Half => Smaller::of(method).map(Self::Smaller),
@@ -188,6 +193,7 @@ impl<'a> PictureMaker<'a> {
             refine: options.refine,
             current: None,
             splats: None,
+            surroundings: 0,
             rasterizer: Rasterizer::new(),
             coverage: 0.0,
             network_seconds: begin.elapsed().as_secs_f64(),
@@ -226,7 +232,15 @@ impl<'a> PictureMaker<'a> {
         let place = |set: Set| IN_ORDER.iter().position(|s| *s == set);
         let mut before = 0.0;
         let (from, to) = (self.current.and_then(place), place(set));
-        let splats = match (from, to, self.splats.take()) {
+        let mut surroundings = 0;
+        let mut splats = match (from, to, self.splats.take()) {
+            (None, None, Some(mut surrounded))
+                if set == Set::Bare && self.current == Some(Set::Refined(Parents::Matched)) =>
+            {
+                before = self.set_seconds;
+                remove_surroundings(&mut surrounded.splats, self.surroundings);
+                surrounded
+            }
             (Some(from), Some(to), Some(splats)) if from < to => {
                 before = self.set_seconds;
                 let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
@@ -246,11 +260,21 @@ impl<'a> PictureMaker<'a> {
                     let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
                     self.finished(network, at, parents)?
                 }
+                Set::Bare => {
+                    let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
+                    self.finished(network, at, Parents::Matched)?
+                }
                 Set::Smaller(smaller) => self.smaller(network, crops, smaller)?,
                 Set::Pair(pair) => self.of_pair(network.model, crops, pair)?,
                 set => SceneChildren::of_splats(self.baseline(network, crops, set)?),
             },
         };
+        if matches!(set, Set::Refined(_) | Set::Smaller(_) | Set::Pair(_)) {
+            let raster = self.raster_options(network, 1.0, None);
+            let (splats, inputs) = (&mut splats.splats, &crops.inputs);
+            surroundings = add_surroundings(splats, inputs, &raster, &mut Renderer::default());
+        }
+        self.surroundings = surroundings;
         self.set_seconds = before + begin.elapsed().as_secs_f64();
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())

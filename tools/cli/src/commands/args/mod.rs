@@ -28,7 +28,7 @@ pub use rendering::{ConventionArg, LowpassArg, MotionArgs, PathArg, RenderingArg
 pub use run::{PictureSizeArg, RunArgs};
 pub use source::{
     AdjustPosesArg, BackboneArg, CropShapeArg, DetailArg, InputSizeArg, MatchingArg, ModelArgs,
-    PresetArg, QualityArg, SourceArgs,
+    PresetArg, QualityArg, SourceArgs, SurroundingsArg,
 };
 
 use super::values;

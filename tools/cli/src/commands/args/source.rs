@@ -139,6 +139,17 @@ pub struct SourceArgs {
         help_heading = QUALITY
     )]
     pub matching: MatchingArg,
+    /// Splats beyond the edges of the photographs.
+    ///
+    /// Views from beside the photographs then have no empty strips. Not added where --gaussians gives a number.
+    #[arg(
+        long,
+        value_enum,
+        default_value = "photo",
+        hide_short_help = true,
+        help_heading = QUALITY
+    )]
+    pub surroundings: SurroundingsArg,
     /// Source of fine texture.
     #[arg(
         long,
@@ -291,6 +302,15 @@ pub enum MatchingArg {
     /// None: the network's own distances.
     Off,
     /// Each pixel moves to the distance at which the photographs agree, where they do.
+    Photo,
+}
+
+/// Splats beyond the edges of the photographs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SurroundingsArg {
+    /// None.
+    Off,
+    /// In the colours at the edges.
     Photo,
 }
 

@@ -3,7 +3,7 @@
 use super::groups::{PICTURES, SIZE};
 use super::{
     AdjustPosesArg, ConventionArg, CropShapeArg, DetailArg, MatchingArg, QualityArg, RenderingArgs,
-    SourceArgs,
+    SourceArgs, SurroundingsArg,
 };
 use crate::commands::values;
 use clap::{Args, ValueEnum};
@@ -148,6 +148,7 @@ impl ViewArgs {
             (source.gaussians.is_some(), "--gaussians"),
             (source.crop != CropShapeArg::Whole, "--crop"),
             (source.matching != MatchingArg::Photo, "--matching"),
+            (source.surroundings != SurroundingsArg::Photo, "--surroundings"),
             (source.detail != DetailArg::Photo, "--detail"),
             (source.fit.is_some(), "--fit"),
             (source.refine.is_some(), "--refine"),
