@@ -93,7 +93,7 @@ pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 pub use crate::reconstruct::{
     Check, Density, DepthBounds, DepthRange, Detail, Error, EstimateOptions, EstimatedPhotos,
     EstimatedScene, InputSize, KnownLens, LensSource, Matching, Options, Photo, Photographs, Poses,
-    Prepared, Progress, Quality, Reconstruction, Reconstructor, Refine, Result, Stage,
+    Prepared, Progress, Quality, Reconstruction, Reconstructor, Refine, Result, SceneSoFar, Stage,
     Surroundings, TargetSize, Warning, estimate_cameras, estimate_cameras_of_files,
 };
 pub use files::photos::image::{LoadOptions, save_depth_png, save_png};

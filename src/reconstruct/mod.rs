@@ -80,7 +80,7 @@ pub use options::{
 };
 pub use photo::{Photo, Photographs};
 pub use poses::PoseError;
-pub use prepared::Prepared;
+pub use prepared::{Prepared, SceneSoFar};
 pub use progress::{Progress, Stage, StageTime};
 pub use projections::{FisheyeCurve, FisheyeLens, Projection};
 pub use reconstruction::Reconstruction;

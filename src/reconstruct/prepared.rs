@@ -15,8 +15,10 @@ use crate::reconstruct::inputs::crop::Cropped;
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Depth;
 use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::RasterOptions;
 
 /// Steps of the estimate of the depth range.
 const RANGE_STEPS: usize = 4;
@@ -83,6 +85,19 @@ impl Prepared<'_> {
     pub fn reconstruct_with(
         self,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    ) -> Result<Reconstruction> {
+        self.reconstruct_showing(progress, &mut |_| {})
+    }
+
+    /// [`Prepared::reconstruct_with`] for a caller that shows the scene while it becomes sharper: `show` receives it
+    /// after each step of the refinement.
+    ///
+    /// # Errors
+    /// Those of [`Prepared::reconstruct_with`].
+    pub fn reconstruct_showing(
+        self,
+        progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+        show: &mut dyn FnMut(&SceneSoFar<'_>),
     ) -> Result<Reconstruction> {
         let Self { model, options, mut inputs, adjustment, cut_shares, bounds, reports, .. } = self;
         let (mut warnings, mut tracker) = (self.warnings, self.tracker);
@@ -176,7 +191,10 @@ impl Prepared<'_> {
         if refine_options.steps > 0 {
             tracker.begin(Stage::Refine, progress)?;
             let mut part = tracker.parts(progress);
-            let mut step = |phase: &PhaseRun<'_>| part(phase.progress());
+            let mut step = |phase: &PhaseRun<'_>| {
+                show(&SceneSoFar { phase, unit, raster: &raster_options });
+                part(phase.progress())
+            };
             let (raster, how) = (&raster_options, &refine_options);
             let (splats, groups) = (&mut splats, &mut groups);
             let done =
@@ -223,6 +241,30 @@ impl Prepared<'_> {
             warnings,
             stage_times: tracker.finish(progress)?,
         })
+    }
+}
+
+/// A scene that a refinement has not ended yet.
+pub struct SceneSoFar<'a> {
+    phase: &'a PhaseRun<'a>,
+    /// Length of the optimisation's unit, world units.
+    unit: f32,
+    raster: &'a RasterOptions,
+}
+
+impl SceneSoFar<'_> {
+    /// The Gaussians after the steps so far, without those beyond the edges of the photographs.
+    pub fn splats(&self) -> Splats {
+        let mut splats = self.phase.splats();
+        if self.unit != 1.0 {
+            unit::scale_splats(&mut splats, self.unit);
+        }
+        splats
+    }
+
+    /// The rules to render them at target resolution.
+    pub fn raster_options(&self) -> RasterOptions {
+        RasterOptions { near: self.raster.near * self.unit, ..*self.raster }
     }
 }
 

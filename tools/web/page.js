@@ -35,6 +35,8 @@ let viewer = null;
 let photographs = [];
 /** The scene that is shown: its .spz and the viewer's settings. */
 let finished = null;
+/** Whether the viewer shows a scene of the reconstruction that runs, and the end of its last change. */
+let isShown = false, showing = Promise.resolve();
 
 function stopWorker(reason) {
   worker?.terminate();
@@ -45,9 +47,13 @@ function stopWorker(reason) {
 function startWorker() {
   stopWorker("Another reconstruction began.");
   worker = new Worker("worker.js");
-  worker.onmessage = ({ data: { id, stage, fraction, answer, error } }) => {
+  worker.onmessage = ({ data: { id, stage, fraction, scene, spz, answer, error } }) => {
     const promise = waiting.get(id);
     if (!promise) return;
+    if (spz !== undefined) {
+      showing = showing.then(() => showSoFar(spz, scene, () => waiting.has(id))).catch(() => {});
+      return;
+    }
     if (stage !== undefined) {
       find("stage").textContent = `${STAGES[stage] ?? stage} …`;
       find("progress").value = fraction;
@@ -179,9 +185,29 @@ async function scenePage() {
   return new Blob([template.replace(/\{\{(\w+)\}\}/g, (_, name) => parts[name])], { type: "text/html" });
 }
 
+/** Shows a scene. The view of an earlier state of the same scene stays. */
+async function show(spz, scene, final) {
+  find("result").hidden = false;
+  viewer ??= new SplatViewer(find("viewer"), {
+    draw: ADDRESS.get("draw") ?? "auto", levels: ADDRESS.get("levels") !== "off",
+    range: ADDRESS.get("range") !== "off", swing: ADDRESS.get("swing") ?? "auto",
+  });
+  await viewer.load(spz, scene, { keep: isShown, final });
+  isShown = true;
+}
+
+/** Shows a scene that is being refined while `runs()`. What is made of a finished one is hidden. */
+async function showSoFar(spz, scene, runs) {
+  if (!runs()) return;
+  for (const id of ["verdict", "downloads", "notes"]) find(id).hidden = true;
+  await show(spz, scene, false);
+  if (runs()) find("news").textContent = "This is the scene so far; it becomes sharper.";
+}
+
 async function reconstruct() {
   showError(null);
   busy(true);
+  isShown = false;
   find("news").textContent = "";
   find("result").hidden = true;
   const begin = performance.now();
@@ -194,12 +220,9 @@ async function reconstruct() {
       signal.addEventListener("abort", () => reject(signal.reason));
     });
     const { scene, spz } = await Promise.race([cancelled, send(signal)]);
-    find("result").hidden = false;
-    viewer ??= new SplatViewer(find("viewer"), {
-      draw: ADDRESS.get("draw") ?? "auto", levels: ADDRESS.get("levels") !== "off",
-      range: ADDRESS.get("range") !== "off", swing: ADDRESS.get("swing") ?? "auto",
-    });
-    await viewer.load(spz, scene);
+    await showing;
+    for (const id of ["verdict", "downloads"]) find(id).hidden = false;
+    await show(spz, scene, true);
     finished = { spz, scene };
     find("clip").hidden = !viewer.canClip();
     find("share").hidden = !canShare(new File([], "scene.html", { type: "text/html" }));
@@ -218,6 +241,8 @@ async function reconstruct() {
     viewer.canvas.focus({ preventScroll: false });
   } catch (error) {
     showError(error.message);
+    // A scene that is not finished cannot be saved.
+    find("result").hidden = true;
   } finally {
     busy(false);
   }

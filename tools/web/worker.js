@@ -2,8 +2,8 @@
 // returns no memory, so the page starts a new worker for the next one.
 //
 // Messages in: { id, task: "reconstruct", module, files: [{ name, bytes }], options } and
-// { id, task: "save", format }. Messages out: { id, stage, fraction }, then { id, answer } or
-// { id, error }. `options` is the input of the library's function `reconstruct`.
+// { id, task: "save", format }. Messages out: { id, stage, fraction }, { id, scene, spz } of a scene
+// that is being refined, then { id, answer } or { id, error }. `options` is the input of the library's function `reconstruct`.
 "use strict";
 
 /** Whether the library can wait for a GPU (JavaScript Promise Integration). */
@@ -11,6 +11,11 @@ const CAN_WAIT = typeof WebAssembly.Suspending === "function";
 
 let library = null;
 let current = 0;
+
+/** The least time between two scenes so far, ms, and the least multiple of what the last one took. */
+const SHOWN_EVERY = 2000, SHOWN_SHARE = 8;
+/** When the library began the last scene so far, and when it may begin the next one, ms. */
+let shown = 0, next = 0;
 
 /** The import `suspend`, which returns after a call of `resume`. */
 const wait = {
@@ -35,6 +40,17 @@ async function open(module) {
     progress(stage, length, fraction) {
       const name = text.decode(new Uint8Array(library.memory.buffer, stage, length));
       postMessage({ id: current, stage: name, fraction });
+    },
+    wants_scene() {
+      shown = performance.now();
+      return shown >= next ? 1 : 0;
+    },
+    scene(...at) {
+      const copy = (from, length) => new Uint8Array(library.memory.buffer, from, length).slice();
+      const spz = copy(at[2], at[3]);
+      postMessage({ id: current, scene: JSON.parse(text.decode(copy(at[0], at[1]))), spz }, [spz.buffer]);
+      const end = performance.now();
+      next = end + Math.max(SHOWN_EVERY, SHOWN_SHARE * (end - shown));
     },
     suspend: CAN_WAIT ? new WebAssembly.Suspending(() => wait.suspend()) : () => {},
     resume: () => wait.resume(),

@@ -102,8 +102,9 @@ class SplatViewer {
   /**
    * Shows a scene. `spz`: the file's bytes; `settings`: `cameras` (of cameras.json, one object each, with a `name`
    * where there is one), `photographs` (false where the cameras are of other views), `background`, `near`, `lowpass`.
+   * `keep`: the scene is a later state of the one before, and the view stays; `final`: no later state follows.
    */
-  async load(spz, settings = {}) {
+  async load(spz, settings = {}, { keep = false, final = true } = {}) {
     const scene = await parseSpz(spz);
     if (scene.count === 0) throw new Error("The scene holds no Gaussian.");
     this.painter.load(scene);
@@ -118,20 +119,24 @@ class SplatViewer {
     const up = cameras.reduce((sum, c) => add(sum, column(c.rotation, 1), -1), [0, 0, 0]);
     this.up = unit(up) ?? [0, 1, 0];
     this.radius = Math.max(0.5 * Math.hypot(...add(box[1], box[0], -1)), 1e-3);
-    this.view = 0;
-    this.fly = false;
-    this.button("fly").setAttribute("aria-pressed", "false");
     this.button("view").hidden = this.cameras.length < 2;
     this.levels = null;
-    this.swinging = null;
-    this.touched = false;
     this.cost = null;
     this.range = this.useRange ? ViewRange.of(scene, cameras) : null;
-    this.reset();
     this.drawn = scene.count;
+    if (keep) {
+      this.redraw();
+    } else {
+      this.view = 0;
+      this.fly = false;
+      this.button("fly").setAttribute("aria-pressed", "false");
+      this.swinging = null;
+      this.touched = false;
+      this.reset();
+    }
     this.sayCount();
     // The range is measured and the levels are made after the first picture.
-    setTimeout(() => this.prepare(scene).catch(() => { this.levels = null; }), 100);
+    if (final) setTimeout(() => this.prepare(scene).catch(() => { this.levels = null; }), 100);
   }
 
   /** Measures the range of views, begins the swing and makes the levels, until another scene is loaded. */

@@ -7,8 +7,9 @@ use std::path::Path;
 use subsplat::scene::render::comment_of_photograph;
 use subsplat::{
     Backend, Camera, DeviceChoice, EstimateOptions, FitOptions, KnownLens, LoadOptions, Options,
-    Photo, Photograph, RasterOptions, Reconstruction, Reconstructor, Refine, Renderer, SaveOptions,
-    SplatFormat, Splats, Warning, encode_splats, estimate_cameras, parse_photograph,
+    Photo, Photograph, Progress, RasterOptions, Reconstruction, Reconstructor, Refine, Renderer,
+    SaveOptions, SceneSoFar, SplatFormat, Splats, Warning, encode_splats, estimate_cameras,
+    parse_photograph,
 };
 
 /// Reports a stage to the page.
@@ -142,12 +143,17 @@ impl Session {
         let (backend, mut reason) = open(&request.network);
         let model = Reconstructor::shipped(request.upscale).map_err(|e| e.to_string())?;
         let model = model.with_backend(&backend);
-        let result = model
-            .run_with(&photos, &options, &mut |p| {
-                report(p.stage.name(), p.fraction);
-                ControlFlow::Continue(())
-            })
-            .map_err(|e| e.to_string())?;
+        let mut progress = |p: Progress| {
+            report(p.stage.name(), p.fraction);
+            ControlFlow::Continue(())
+        };
+        let prepared = model.prepare_with(&photos, &options, &mut progress);
+        let prepared = prepared.map_err(|e| e.to_string())?;
+        let places: Vec<Camera> = prepared.inputs().iter().map(|c| c.target_camera).collect();
+        let cameras: Vec<(String, Camera)> = names.into_iter().zip(places).collect();
+        let mut show = |scene: &SceneSoFar<'_>| host::show(|| so_far(scene, &cameras));
+        let result = prepared.reconstruct_showing(&mut progress, &mut show);
+        let result = result.map_err(|e| e.to_string())?;
         let (of_gpu, rest): (Vec<Warning>, Vec<Warning>) = result
             .warnings()
             .iter()
@@ -156,8 +162,6 @@ impl Session {
         reason = of_gpu.last().map(Warning::to_string).or(reason);
         warnings.extend(Warning::sentences(&rest));
         let processor = if backend.is_cpu() { "cpu" } else { "gpu" };
-        let places = result.inputs().iter().map(|c| c.target_camera);
-        let cameras: Vec<(String, Camera)> = names.into_iter().zip(places).collect();
         let photographs = cameras.iter().map(|(name, camera)| comment_of_photograph(name, camera));
         self.scene = Some(Scene {
             options: *result.raster_options(),
@@ -199,6 +203,17 @@ impl Session {
         let options = SaveOptions { comments: scene.comments.clone(), ..SaveOptions::default() };
         encode_splats(format, &scene.splats, &options).map_err(|e| e.to_string())
     }
+}
+
+/// Description and .spz of a scene that is being refined; `None` where it cannot be encoded.
+fn so_far(scene: &SceneSoFar<'_>, cameras: &[(String, Camera)]) -> Option<[Vec<u8>; 2]> {
+    let description = bytes(&json!({
+        "background": scene.raster_options().background,
+        "cameras": cameras.iter().map(named_camera).collect::<Vec<_>>(),
+        "photographs": true,
+    }));
+    let spz = encode_splats(SplatFormat::Spz, &scene.splats(), &SaveOptions::default()).ok()?;
+    Some([description, spz])
 }
 
 /// Judges a scene by its photographs.
