@@ -21,7 +21,7 @@ use std::ops::ControlFlow;
 use subsplat_kernels::layout::RasterOptions;
 
 /// Options of [`fit`]. The defaults were chosen on nine of the sixteen pairs of photographs that
-/// `src/network/shipped/README.md` reports (scenes fox, hololens_table, re10k_0bf and re10k_0f68).
+/// `tools/lab/tried.md` reports (scenes fox, hololens_table, re10k_0bf and re10k_0f68).
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct FitOptions {

@@ -11,7 +11,7 @@
 //! a merge nothing. A fit of the merged Gaussians to the pictures of all changed nothing.
 //!
 //! Neighbours of one colour carry nothing of their own, while every Gaussian that is removed leaves a gap: hence
-//! merges, not removal (table in `src/network/shipped/README.md`).
+//! merges, not removal (table in `tools/lab/tried.md`).
 //!
 //! The same input gives the same bytes on any number of threads.
 

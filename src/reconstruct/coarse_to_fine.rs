@@ -13,7 +13,7 @@
 //! `subsplat-lab eval PHOTOS --upscale 2 --methods enlarged,direct,refine` on the 16 pairs of
 //! `../shared/photos` (PSNR / SSIM of new views): without both 19.25 / .694, with both 19.90 / .724; a whole
 //! run at the input's size, enlarged by Lanczos: 19.44 / .676. What was tried and left out is in
-//! `src/network/shipped/README.md`.
+//! `tools/lab/tried.md`.
 
 use super::children::GAIN_WITH_OFFSETS;
 use super::{Error, Result, finishing};

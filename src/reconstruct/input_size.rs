@@ -3,7 +3,7 @@
 //! The input keeps the photographs' shape. Its area may deviate by a quarter from the one asked for, because the
 //! stride is 32 px and photographs are cropped, never stretched. A larger input is no default. It gains
 //! 1 to 3 dB at the inputs' cameras, but new views of pairs with little overlap lose as much
-//! (`src/network/shipped/README.md`, "Size of the input").
+//! (`tools/lab/tried.md`, "Size of the input").
 
 use subsplat_kernels::camera::Size;
 

@@ -2,7 +2,7 @@
 //!
 //! K that is no square has the lattice or grid with the widest spacing. The R2 sequence was considered, but its
 //! first points are not centred in their pixel. Squares serve better than other K
-//! (`src/network/shipped/README.md`, "Limits on the Gaussians"), so limits on the number of Gaussians choose among them.
+//! (`tools/lab/tried.md`, "Limits on the Gaussians"), so limits on the number of Gaussians choose among them.
 
 /// Positions of the K children in (−½, ½)², input px: a grid for square K, else the better one of a
 /// grid of whole rows and a lattice.

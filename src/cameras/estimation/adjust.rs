@@ -7,7 +7,7 @@
 //! similarity then moves the cameras back, so that other cameras of the same scene stay valid.
 //!
 //! Poses as parameters of the refinement were tried instead: 0.03 to 0.3 px a step change an error of 0.5° by a tenth
-//! only, because Gaussians follow wrong poses faster. Measurements: `src/network/shipped/README.md`, "The refinement".
+//! only, because Gaussians follow wrong poses faster. Measurements: `tools/lab/tried.md`, "The refinement".
 
 use super::absolute::Absolute;
 use super::edges::{Edge, edges};

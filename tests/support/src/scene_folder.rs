@@ -58,6 +58,8 @@ fn example() -> &'static Example {
                 photographic: false,
                 foreground: 0.0,
                 scattered: 0.0,
+                floating: 0.0,
+                log_baseline: 0.0,
                 wide: 0.0,
                 samples: 1,
                 fine_textures: false,

@@ -7,7 +7,7 @@
 //! keeps its depth exactly.
 //!
 //! With nine views of rooms this lowers the error of depth by 6 %
-//! (src/network/shipped/README.md, "Many photographs").
+//! (tools/lab/tried.md, "Many photographs").
 //!
 //! In: pictures, cameras, distances along the unit rays, confidences, tolerances. Out: distances,
 //! `[V, H·W]`. No gradient: the choice has no derivative. Oracle: the same in f64 by matrices (the

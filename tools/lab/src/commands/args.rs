@@ -124,8 +124,4 @@ pub struct TrainArgs {
     /// Stop after this many steps, with a checkpoint.
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
-    /// This process is number I, from 0, of N that share the training: same configuration, same --out.
-    /// The weights are those of one process. A step needs at least N groups of `together` scenes.
-    #[arg(long, value_name = "I/N", value_parser = values::part)]
-    pub rank: Option<(usize, usize)>,
 }

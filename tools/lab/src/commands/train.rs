@@ -3,7 +3,8 @@
 use super::args::TrainArgs;
 use super::tensorboard::Board;
 use crate::train::TrainConfig;
-use crate::train::ranks::Ranks;
+use crate::train::peers;
+use crate::train::ranks::agree;
 use crate::train::run::{Event, Limits, StepReport, Training};
 use crate::train::step::Seconds;
 use crate::train::validate::{Found, Validator};
@@ -33,18 +34,28 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     // Candle runs operations on large tensors in its own thread pool. Its idle threads spin, and
     // take the cores from this crate's: 40 steps took 28.8 s with the pool and 20.7 s without.
     environment::restart_with("CANDLE_NUM_THREADS", || "1".into());
-    let config = TrainConfig::load(&args.config)?;
+    let mut peers = peers::connect()?;
+    // Rank 0 keeps the records of a shared training.
+    let first = peers.ranks().rank == 0;
+    // What one rank cannot read or write ends all of them.
+    let config = agree(&mut *peers, TrainConfig::load(&args.config))?;
     let stop = stop_on_interrupt()?;
     let limits = Limits { minutes: args.minutes, steps: args.steps, stop: Some(&stop) };
-    let ranks = args.rank.map_or(Ranks::single(), |(rank, count)| Ranks::new(rank, count));
-    let mut training = Training::open_rank(&config, &args.out, ranks)?;
+    let mut training = Training::open_shared(&config, &args.out, peers)?;
     let mut watch = Watch::new(&config, limits);
-    // Rank 0 keeps the records of a shared training.
-    let first = ranks.rank == 0;
-    let mut board = if first { Some(Board::create(&args.out)?) } else { None };
+    let board = first.then(|| Board::create(&args.out)).transpose();
+    let mut board = training.agree(board)?;
     let mut unwritten = None;
-    let validator = Validator::new(&config, args.validate.as_deref())?;
+    let validator = if first {
+        Validator::new(&config, args.validate.as_deref())
+    } else {
+        Validator::without_scenes(&config)
+    };
+    let validator = training.agree(validator)?;
     let outcome = training.run(limits, &validator, &mut |event| {
+        if !first {
+            return;
+        }
         watch.handle(event);
         if let (None, Some(board)) = (&unwritten, &mut board) {
             unwritten = board.record(event).err();
@@ -58,9 +69,12 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     if let Some(warning) = training.warning() {
         print_warning(warning);
     }
+    if !first {
+        return Ok(());
+    }
     let progress = training.progress();
     // The file is absent before the first checkpoint.
-    let weights = Some(args.out.join("weights.safetensors")).filter(|file| first && file.is_file());
+    let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
     let saved = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
     let (done, steps) = (progress.step, config.steps);
     let stopped = stop.load(Ordering::Relaxed);

@@ -154,6 +154,11 @@ pub struct Data {
     /// Share of scenes that show shapes at random places, indoors or outdoors, instead of a
     /// furnished room.
     pub scattered: f32,
+    /// Share of furnished rooms with objects in the air.
+    pub floating: f32,
+    /// Share of scenes with baselines of uniform logarithm
+    /// ([`crate::data::procedural::CameraRange::LogBaseline`]).
+    pub log_baseline: f32,
     /// Share of scenes with a wide range of fields of view, baselines and rotations
     /// ([`crate::data::procedural::CameraRange::Wide`]).
     pub wide: f32,
@@ -166,8 +171,8 @@ pub struct Data {
     /// ([`super::source::Rooms::seen_range`]).
     pub seen_range: f32,
     /// Pictures on disk instead of procedural rooms. `scenes`, `samples`, `target_samples`, `crop`,
-    /// `photographic`, `foreground`, `scattered`, `wide`, `input_targets`, `detail` and
-    /// `seen_range` are then ignored, and depth is unknown.
+    /// `photographic`, `foreground`, `scattered`, `floating`, `log_baseline`, `wide`,
+    /// `input_targets`, `detail` and `seen_range` are then ignored, and depth is unknown.
     pub files: Option<Files>,
     /// Scenes that are repeated before the next ones are made.
     pub window: u64,
@@ -195,6 +200,8 @@ impl Default for Data {
             photographic: true,
             foreground: 0.0,
             scattered: 0.0,
+            floating: 0.0,
+            log_baseline: 0.0,
             wide: 0.0,
             input_targets: false,
             detail: 0.0,
@@ -277,13 +284,15 @@ impl Default for Checkpoints {
 pub struct Validation {
     /// Minutes between two checkpoints or validations.
     pub minutes: f64,
+    /// Steps between two validations, instead of `minutes`; 0: `minutes` decides.
+    pub steps: u64,
     /// Number of procedural scenes, from a seed that training does not use.
     pub scenes: usize,
 }
 
 impl Default for Validation {
     fn default() -> Self {
-        Self { minutes: 15.0, scenes: 8 }
+        Self { minutes: 15.0, steps: 0, scenes: 8 }
     }
 }
 
@@ -462,6 +471,8 @@ impl TrainConfig {
             ("data.seen_range", f64::from(self.data.seen_range)),
             ("data.foreground", f64::from(self.data.foreground)),
             ("data.scattered", f64::from(self.data.scattered)),
+            ("data.floating", f64::from(self.data.floating)),
+            ("data.log_baseline", f64::from(self.data.log_baseline)),
             ("data.wide", f64::from(self.data.wide)),
             ("data.detail", f64::from(self.data.detail)),
             ("data.augment.flip", a.flip),

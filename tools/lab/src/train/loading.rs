@@ -69,7 +69,7 @@ impl Shared {
     fn work(&self) {
         loop {
             let mut queue = self.lock();
-            let ahead = self.options.ahead.max(1) * self.options.division.count();
+            let ahead = self.options.ahead.max(1) * self.options.division.ranks().count;
             while queue.next_to_start >= queue.next_to_take + ahead as u64
                 && !self.stop.load(Ordering::Relaxed)
             {

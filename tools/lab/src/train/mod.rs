@@ -4,7 +4,8 @@
 //! examples and their order derive from seeds, and every kernel gives the same bytes for any number
 //! of threads. A checkpoint therefore holds the parameters, the optimizer's state and the step. A
 //! resumed training takes the same steps as an uninterrupted one (`tools/lab/tests/cli/train.rs`).
-//! Several processes that share a training take these steps too ([`ranks`]).
+//! Several processes that share a training take these steps too ([`ranks`]), over MPI with the feature
+//! `mpi` ([`peers`]).
 
 pub mod augment;
 pub mod checkpoint;
@@ -14,6 +15,7 @@ pub mod folders;
 pub mod loading;
 pub mod loss;
 pub mod optimizer;
+pub mod peers;
 pub mod photos;
 pub mod ranks;
 pub mod run;
@@ -56,6 +58,16 @@ pub enum Error {
         expected: String,
         /// Value found.
         got: String,
+    },
+    /// Another process of a shared training failed.
+    #[error("rank {rank} of {count}: {message}")]
+    Rank {
+        /// Number of the process.
+        rank: usize,
+        /// Number of processes.
+        count: usize,
+        /// Its error.
+        message: String,
     },
     /// Loss or gradient were not finite in several consecutive steps.
     #[error(

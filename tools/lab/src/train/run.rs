@@ -5,12 +5,13 @@ use super::config::{Start, TrainConfig};
 use super::files::Pictures;
 use super::loading::{Loader, LoaderOptions};
 use super::optimizer::Optimizer;
-use super::ranks::{Division, Exchange, Ranks};
+use super::ranks::{Alone, Division, Exchange, Peers, Ranks, agree};
 use super::source::{Example, Replay, Source};
-use super::step::{Learner, Seconds, StepScale, Terms};
+use super::step::{GroupSum, Learner, Seconds, StepScale, Terms};
 use super::validate::{self, Found, Split, Validator};
 use super::{Error, Result};
 use candle_core::Tensor;
+use std::fmt::Display;
 use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -109,9 +110,9 @@ pub struct Training {
     exchange: Option<Exchange>,
     /// Wish of this process to end after the step.
     end: bool,
-    rank: usize,
-    /// Lock of the folder against other trainings.
-    _lock: File,
+    division: Division,
+    /// Lock of the folder against other trainings, which rank 0 holds.
+    _lock: Option<File>,
 }
 
 /// Opens the source of examples that `config` specifies.
@@ -123,12 +124,9 @@ fn source(config: &TrainConfig) -> Result<Arc<dyn Source>> {
     })
 }
 
-/// Locks the folder for one rank while the returned file is open.
-fn lock_folder(folder: &Path, rank: usize) -> Result<File> {
-    let path = match rank {
-        0 => folder.join("lock"),
-        _ => folder.join(format!("lock-{rank}")),
-    };
+/// Locks the folder while the returned file is open.
+fn lock_folder(folder: &Path) -> Result<File> {
+    let path = folder.join("lock");
     let file = File::options().create(true).append(true).open(&path);
     let file = file.map_err(|e| io::Error::io(&path, e))?;
     match file.try_lock() {
@@ -170,18 +168,30 @@ impl Training {
     /// An invalid configuration; weights or a checkpoint that do not fit; a folder that cannot be
     /// created or is in use.
     pub fn open(config: &TrainConfig, folder: &Path) -> Result<Self> {
-        Self::open_rank(config, folder, Ranks::single())
+        Self::open_shared(config, folder, Box::new(Alone))
     }
 
     /// [`Training::open`] as one of several processes that share the training. All of them receive
     /// the same configuration and the same folder, and begin with the same checkpoint.
     ///
     /// # Errors
-    /// As [`Training::open`]; a rank out of range; more ranks than groups of scenes in a step.
-    pub fn open_rank(config: &TrainConfig, folder: &Path, ranks: Ranks) -> Result<Self> {
-        Self::with(config, folder, source(config)?, ranks)
+    /// As [`Training::open`]; more ranks than groups of scenes in a step; another rank that cannot
+    /// open the training.
+    pub fn open_shared(
+        config: &TrainConfig,
+        folder: &Path,
+        mut peers: Box<dyn Peers>,
+    ) -> Result<Self> {
+        let ranks = peers.ranks();
+        let opened = source(config).and_then(|source| Self::with(config, folder, source, ranks));
+        let mut training = agree(&mut *peers, opened)?;
+        if ranks.count > 1 {
+            training.exchange = Some(Exchange::new(config, peers)?);
+        }
+        Ok(training)
     }
 
+    /// Opens the training of one rank, without its connection to the others.
     fn with(
         config: &TrainConfig,
         folder: &Path,
@@ -191,7 +201,7 @@ impl Training {
         config.check()?;
         ranks.check(config)?;
         std::fs::create_dir_all(folder).map_err(|e| io::Error::io(folder, e))?;
-        let lock = lock_folder(folder, ranks.rank)?;
+        let lock = if ranks.rank == 0 { Some(lock_folder(folder)?) } else { None };
         let warnings = source.warnings();
         let newest = checkpoint::steps(folder).last().map(|s| checkpoint::path(folder, *s));
         let weights = match newest {
@@ -214,17 +224,14 @@ impl Training {
         if let Some(executor) = learner.executor() {
             optimizer.set_device(executor, learner.backend())?;
         }
+        let division = Division::of(config, ranks);
         let data = &config.data;
         let options = LoaderOptions {
             augmentation: data.augment,
             seed: config.seed,
             workers: data.workers,
             ahead: data.ahead,
-            division: Division::of(config, ranks),
-        };
-        let exchange = match ranks.count {
-            1 => None,
-            _ => Some(Exchange::open(folder, config, ranks)?),
+            division,
         };
         let loader = Loader::start(source, options, progress.examples)?;
         Ok(Self {
@@ -237,9 +244,9 @@ impl Training {
             resumed: newest,
             untrained,
             warnings,
-            exchange,
+            exchange: None,
             end: false,
-            rank: ranks.rank,
+            division,
             _lock: lock,
         })
     }
@@ -269,59 +276,38 @@ impl Training {
     /// Returns `None` if loss or gradient were not finite; the weights are then unchanged.
     ///
     /// # Errors
-    /// An error of the source or the network; another rank whose gradients are missing; too many
+    /// An error of the source or the network, of this or another rank; too many
     /// consecutive steps that were not finite.
     pub fn step(&mut self) -> Result<Option<StepReport>> {
         let begin = Instant::now();
-        let config = &self.config;
         let step = self.progress.step;
         let mut seconds = Seconds::default();
         let mut gradients = self.optimizer.gradients();
         let mut terms = Terms::default();
-        let scale = StepScale { share: 1.0 / config.examples_per_step() as f64, step };
+        let scale = StepScale { share: 1.0 / self.config.examples_per_step() as f64, step };
         if let Some(exchange) = &mut self.exchange {
             exchange.begin(step, &self.optimizer);
         }
-        for round in 0..config.accumulate {
-            let start = Instant::now();
-            let examples =
-                (0..config.batch).map(|_| self.loader.take()).collect::<Result<Vec<_>>>()?;
-            seconds.data += start.elapsed().as_secs_f64();
-            // A group has one rank, so the examples of a group are all here or all elsewhere.
-            let groups: Vec<Vec<&Example>> = examples
-                .chunks(config.together.max(1))
-                .map(|g| g.iter().flatten().collect())
-                .collect();
-            let own: Vec<Vec<&Example>> =
-                groups.iter().filter(|group| !group.is_empty()).cloned().collect();
-            let sums = self.learner.group_sums(&own, scale, &self.optimizer)?;
-            let number = |group: usize| round * groups.len() + group;
-            if let Some(exchange) = &mut self.exchange {
-                let here = (0..groups.len()).filter(|group| !groups[*group].is_empty());
-                for (group, sum) in here.zip(&sums) {
-                    exchange.publish(number(group), sum, self.end)?;
-                }
-            }
-            let mut sums = sums.into_iter();
+        for round in 0..self.config.accumulate {
+            let own = self.own_groups(scale, &mut seconds);
+            let sums = match &mut self.exchange {
+                Some(exchange) => exchange.round(own, self.end, &self.optimizer)?,
+                None => vec![own?],
+            };
+            let mut sums: Vec<_> = sums.into_iter().map(Vec::into_iter).collect();
             let mut of_round = Terms::default();
             // In the order of the groups: the sums do not depend on their processes.
-            for (group, chunk) in examples.chunks(config.together.max(1)).enumerate() {
-                let own = if groups[group].is_empty() { None } else { sums.next() };
-                let sum = match (own, &mut self.exchange) {
-                    (Some(sum), _) => sum,
-                    (None, Some(exchange)) => {
-                        let all = config.accumulate * groups.len();
-                        exchange.receive(number(group), all, &self.optimizer)?
-                    }
-                    (None, None) => {
-                        return Err(Error::value("step", "a result of every scene", "none"));
-                    }
-                };
-                let share = chunk.len() as f64 / examples.len() as f64;
+            for group in 0..self.division.groups() {
+                let owner = self.division.owner(step, round, group);
+                let sum = sums.get_mut(owner).and_then(Iterator::next);
+                let sum =
+                    sum.ok_or_else(|| Error::value("step", "a result of every scene", "none"))?;
+                let share = self.division.scenes(group) as f64 / self.config.batch as f64;
                 sum.add_to(&mut gradients, &mut of_round, &mut seconds, share);
             }
-            terms.add(&of_round, 1.0 / config.accumulate as f64);
+            terms.add(&of_round, 1.0 / self.config.accumulate as f64);
         }
+        let config = &self.config;
         let start = Instant::now();
         let norm = self.optimizer.norm(&gradients)?;
         let rate = config.schedule.rate(step, config.steps);
@@ -339,6 +325,36 @@ impl Training {
         }
         let report = StepReport { step: self.progress.step, terms, norm, rate, seconds };
         Ok(finite.then_some(report))
+    }
+
+    /// Takes the examples of a batch, and computes the groups of this rank in their order.
+    fn own_groups(&mut self, scale: StepScale, seconds: &mut Seconds) -> Result<Vec<GroupSum>> {
+        let start = Instant::now();
+        let take = |_| self.loader.take();
+        let examples = (0..self.config.batch).map(take).collect::<Result<Vec<_>>>()?;
+        seconds.data += start.elapsed().as_secs_f64();
+        // A group has one rank, so the examples of a group are all here or all elsewhere.
+        let groups = examples.chunks(self.config.together.max(1));
+        let groups: Vec<Vec<&Example>> = groups
+            .map(|group| group.iter().flatten().collect::<Vec<_>>())
+            .filter(|group| !group.is_empty())
+            .collect();
+        self.learner.group_sums(&groups, scale, &self.optimizer)
+    }
+
+    /// Returns the value of `own` if all ranks of the training have one. All ranks call it at the same
+    /// point.
+    ///
+    /// # Errors
+    /// The error of `own`; otherwise that of the first rank that failed.
+    pub fn agree<T, E: Display + From<Error>>(
+        &mut self,
+        own: std::result::Result<T, E>,
+    ) -> std::result::Result<T, E> {
+        match &mut self.exchange {
+            Some(exchange) => exchange.agree(own),
+            None => own,
+        }
     }
 
     /// Writes a checkpoint, and the averaged weights as `weights.safetensors`.
@@ -371,6 +387,17 @@ impl Training {
         validator: &Validator,
         report_event: &mut dyn FnMut(&Event),
     ) -> Result<()> {
+        let outcome = self.run_rank(limits, validator, report_event);
+        self.agree(outcome)
+    }
+
+    /// [`Training::run`] of this rank.
+    fn run_rank(
+        &mut self,
+        limits: Limits<'_>,
+        validator: &Validator,
+        report_event: &mut dyn FnMut(&Event),
+    ) -> Result<()> {
         report_event(&Event::Begin {
             step: self.progress.step,
             parameters: self.optimizer.parameters(),
@@ -378,13 +405,14 @@ impl Training {
             untrained: self.untrained,
             warnings: self.warnings.clone(),
         });
-        let mut log = match self.rank {
+        let mut log = match self.division.ranks().rank {
             0 => Some(Log::open(&self.folder, self.progress.step)?),
             _ => None,
         };
         let begin = Instant::now();
         let minutes = |since: Instant| since.elapsed().as_secs_f64() / 60.0;
         let (mut saved, mut validated) = (Instant::now(), Instant::now());
+        let mut validated_step = None;
         let mut done = 0;
         let reached = |done: u64| {
             limits.steps.is_some_and(|n| done >= n)
@@ -403,7 +431,7 @@ impl Training {
             self.end = reached(done + 1);
             let taken = self.step();
             if taken.is_err() && self.exchange.is_some() && log.is_some() && done > 0 {
-                // Another rank is missing; the steps so far are complete.
+                // A rank failed; the steps so far are complete.
                 report_event(&Event::Saved(self.save()?));
             }
             match taken? {
@@ -421,24 +449,26 @@ impl Training {
                 report_event(&Event::Saved(self.save()?));
                 saved = Instant::now();
             }
-            if minutes(validated) >= self.config.validate.minutes && !limits.stopped() {
+            let due = match self.config.validate.steps {
+                0 => minutes(validated) >= self.config.validate.minutes,
+                every => self.progress.step.is_multiple_of(every),
+            };
+            if due && !limits.stopped() {
                 self.validate(validator, log, report_event)?;
                 validated = Instant::now();
+                validated_step = Some(self.progress.step);
             }
         }
         if let Some(log) = &mut log {
             if done > 0 {
                 report_event(&Event::Saved(self.save()?));
-                if !limits.stopped() {
+                if !limits.stopped() && validated_step != Some(self.progress.step) {
                     self.validate(validator, log, report_event)?;
                 }
             } else if self.resumed.is_some() {
                 // The training may have stopped between its checkpoint and its weights.
                 self.save_weights()?;
             }
-        }
-        if let Some(exchange) = &mut self.exchange {
-            exchange.close();
         }
         Ok(())
     }

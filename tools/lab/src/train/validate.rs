@@ -71,6 +71,8 @@ pub fn rooms(config: &TrainConfig, split: Split) -> Result<Rooms> {
     spec.photographic = data.photographic;
     spec.foreground = data.foreground;
     spec.scattered = data.scattered;
+    spec.floating = data.floating;
+    spec.log_baseline = data.log_baseline;
     spec.wide = data.wide;
     spec.samples = data.samples;
     let targets = crate::data::procedural::TargetSpec {
@@ -88,6 +90,14 @@ pub fn rooms(config: &TrainConfig, split: Split) -> Result<Rooms> {
 }
 
 impl Validator {
+    /// Returns a validator that evaluates nothing.
+    ///
+    /// # Errors
+    /// An invalid model configuration.
+    pub fn without_scenes(config: &TrainConfig) -> Result<Self> {
+        Ok(Self { model: config.model_config()?, scenes: Vec::new(), photos: Vec::new() })
+    }
+
     /// Makes the scenes, and reads the photographs in `photos`, which are evaluated only.
     ///
     /// # Errors

@@ -4,5 +4,6 @@ mod compare_raster;
 mod eval_cli;
 mod paper;
 mod program;
+mod ranks;
 mod train;
 mod usage;

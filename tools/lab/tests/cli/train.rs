@@ -4,14 +4,13 @@
 use subsplat_test_support::made_up;
 
 use std::path::Path;
-use std::time::Duration;
 use subsplat::files::poses::cameras_json::{CameraFile, save_cameras_json};
 use subsplat::files::poses::scene::Units;
 use subsplat_kernels::camera::NearFar;
 use subsplat_lab::train::TrainConfig;
 use subsplat_lab::train::checkpoint;
+use subsplat_lab::train::config::Start;
 use subsplat_lab::train::optimizer::State;
-use subsplat_lab::train::ranks::Ranks;
 use subsplat_lab::train::run::{Event, Limits, Training};
 use subsplat_lab::train::validate::Validator;
 
@@ -62,15 +61,15 @@ warmup = 2
 scenes = 1
 "#;
 
-fn tiny(phase: &str) -> TrainConfig {
+pub(crate) fn tiny(phase: &str) -> TrainConfig {
     TrainConfig::from_toml(&TINY.replace("PHASE", phase)).unwrap()
 }
 
-fn steps(training: &mut Training, n: usize) -> Vec<f64> {
+pub(crate) fn steps(training: &mut Training, n: usize) -> Vec<f64> {
     (0..n).map(|_| training.step().unwrap().unwrap().terms.loss).collect()
 }
 
-fn state(training: &Training) -> Vec<(String, Vec<u32>)> {
+pub(crate) fn state(training: &Training) -> Vec<(String, Vec<u32>)> {
     let bits = |t: &candle_core::Tensor| -> Vec<u32> {
         t.flatten_all().unwrap().to_vec1::<f32>().unwrap().iter().map(|v| v.to_bits()).collect()
     };
@@ -99,109 +98,6 @@ fn a_resumed_run_equals_an_unstopped_one_bit_for_bit() {
         // The comparison sees a difference.
         steps(&mut unstopped, 1);
         assert_ne!(state(&second), state(&unstopped));
-    }
-}
-
-/// Runs `body` for every rank of a training in `folder`, each on a thread of its own.
-fn in_ranks<R: Send>(
-    (config, folder): (&TrainConfig, &Path),
-    count: usize,
-    body: impl Fn(usize, Training) -> R + Sync,
-) -> Vec<R> {
-    let open = |rank| {
-        let ranks = Ranks { wait: Duration::from_secs(120), ..Ranks::new(rank, count) };
-        Training::open_rank(config, folder, ranks).unwrap()
-    };
-    std::thread::scope(|scope| {
-        let body = &body;
-        let threads: Vec<_> =
-            (0..count).map(|rank| scope.spawn(move || body(rank, open(rank)))).collect();
-        threads.into_iter().map(|thread| thread.join().unwrap()).collect()
-    })
-}
-
-/// Several processes take the steps of one, bit for bit, from a checkpoint too.
-#[test]
-fn ranks_share_a_training() {
-    for (phase, together) in [("depth", 1), ("render", 2)] {
-        let config = TrainConfig { batch: 3, together, accumulate: 2, ..tiny(phase) };
-        let [whole, shared] = [(); 2].map(|()| tempfile::tempdir().unwrap());
-        let mut one = Training::open(&config, whole.path()).unwrap();
-        let losses = steps(&mut one, 3);
-        let expected = (losses[..2].to_vec(), state(&one));
-        for count in [2, 3] {
-            let folder = tempfile::tempdir().unwrap();
-            let all = in_ranks((&config, folder.path()), count, |_, mut training| {
-                (steps(&mut training, 3), state(&training))
-            });
-            for (rank, (found, weights)) in all.iter().enumerate() {
-                assert_eq!(found, &losses, "{phase}, rank {rank} of {count}");
-                assert!(weights == &expected.1, "{phase}, rank {rank} of {count}");
-            }
-        }
-        let ranks = in_ranks((&config, shared.path()), 2, |rank, mut training| {
-            let found = steps(&mut training, 2);
-            if rank == 0 {
-                training.save().unwrap();
-            }
-            found
-        });
-        assert!(ranks.iter().all(|found| *found == expected.0), "{phase}");
-        // One process goes on where two ended.
-        let mut resumed = Training::open(&config, shared.path()).unwrap();
-        assert_eq!((steps(&mut resumed, 1), state(&resumed)), (losses[2..].to_vec(), expected.1));
-    }
-}
-
-/// The first rank writes the files; a limit of one rank ends all after the same step.
-#[test]
-fn ranks_end_together() {
-    let config = tiny("depth");
-    let folder = tempfile::tempdir().unwrap();
-    let ends = in_ranks((&config, folder.path()), 2, |rank, mut training| {
-        let validator = Validator::new(&config, None).unwrap();
-        let steps = (rank == 1).then_some(2);
-        let mut saved = 0;
-        let limits = Limits { steps, ..Limits::default() };
-        let mut count = |e: &Event| saved += usize::from(matches!(e, Event::Saved(_)));
-        training.run(limits, &validator, &mut count).unwrap();
-        (training.progress().step, saved)
-    });
-    assert_eq!(ends, [(2, 1), (2, 0)]);
-    assert_eq!(checkpoint::steps(folder.path()), [2]);
-    assert!(folder.path().join("weights.safetensors").is_file());
-    assert!(!folder.path().join("exchange").exists());
-}
-
-/// A rank that does not come, or has another configuration, ends the wait with its name.
-#[test]
-fn a_missing_rank_is_named() {
-    let config = tiny("depth");
-    let folder = tempfile::tempdir().unwrap();
-    let ranks = Ranks { wait: Duration::from_millis(200), ..Ranks::new(0, 2) };
-    let mut alone = Training::open_rank(&config, folder.path(), ranks).unwrap();
-    let refused = alone.step().unwrap_err().to_string();
-    assert!(refused.starts_with("rank 1 of 2: expected its gradients of step 1"), "{refused}");
-    assert!(refused.contains("got none"), "{refused}");
-    let twice = Training::open_rank(&config, folder.path(), ranks).err().unwrap().to_string();
-    assert!(twice.contains("without another training"), "{twice}");
-    drop(alone);
-
-    // The weights are the same.
-    let other = TrainConfig { steps: 41, ..tiny("depth") };
-    let found = std::thread::scope(|scope| {
-        let rank = |config, rank| {
-            let ranks = Ranks { wait: Duration::from_secs(3), ..Ranks::new(rank, 2) };
-            let path = folder.path();
-            move || {
-                Training::open_rank(config, path, ranks).unwrap().step().unwrap_err().to_string()
-            }
-        };
-        let second = scope.spawn(rank(&other, 1));
-        [rank(&config, 0)(), second.join().unwrap()]
-    });
-    for text in &found {
-        assert!(text.contains("got those of another configuration"), "{text}");
     }
 }
 
@@ -493,10 +389,15 @@ fn errors_name_key_and_value() {
 fn every_preset_file_is_a_configuration() {
     let folder = subsplat_test_support::repository().join("tools/lab/train");
     let mut count = 0;
-    for entry in std::fs::read_dir(folder).unwrap() {
+    for entry in std::fs::read_dir(&folder).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_some_and(|e| e == "toml") {
-            TrainConfig::load(&path).unwrap();
+            let config = TrainConfig::load(&path).unwrap();
+            // Weights that the repository ships, or those of another training from its root.
+            if let Start::Weights { path: weights, .. } = &config.init {
+                let made = weights.starts_with(folder.join("../../../out"));
+                assert!(made || weights.is_file(), "{}: no {}", path.display(), weights.display());
+            }
             count += 1;
         }
     }

@@ -274,6 +274,33 @@ fn scattered_scenes_and_wide_cameras_are_shares() {
 }
 
 #[test]
+fn floating_objects_and_log_baselines_are_shares() {
+    let plain = ExampleSpec::new(24, 24, 1);
+    let floating = ExampleSpec { floating: 1.0, ..plain };
+    let log = ExampleSpec { log_baseline: 1.0, ..plain };
+    let mut baselines = Vec::new();
+    for seed in 0..20 {
+        let of = |spec: &ExampleSpec| Example::new(seed, spec);
+        let (own, with_objects, spread) = (of(&plain), of(&floating), of(&log));
+        // Objects change pictures, not cameras; their unit of length follows the nearest surface.
+        let rotations = |e: &Example| e.cameras.iter().map(|c| c.rotation()).collect::<Vec<_>>();
+        assert_eq!(rotations(&own), rotations(&with_objects));
+        let same = |x: &Example, y: &Example| x.views[0].rgb == y.views[0].rgb;
+        let half = of(&ExampleSpec { floating: 0.5, log_baseline: 0.5, ..plain });
+        let both = of(&ExampleSpec { floating: 1.0, ..log });
+        let found = [&own, &with_objects, &spread, &both];
+        assert!(found.iter().any(|e| same(e, &half)), "seed {seed}: none of the four kinds");
+        let mut depth = spread.views[0].depth.clone();
+        depth.sort_by(f32::total_cmp);
+        let [a, b] = [0, 1].map(|i| spread.cameras[i].position());
+        baselines.push(a.distance(b) / depth[depth.len() / 2]);
+    }
+    baselines.sort_by(f32::total_cmp);
+    // The other range begins at 0.05 of the median depth and ends at 0.38.
+    assert!(baselines[3] < 0.05 && baselines[18] > 0.38, "{baselines:?}");
+}
+
+#[test]
 fn rooms_have_realistic_sizes_and_numbers_of_solids() {
     let n = 200;
     let mut solids = 0;

@@ -41,6 +41,9 @@ pub enum CameraRange {
     /// depth, at most 28° about each axis. Each view sees at least 40 % of the other.
     #[default]
     HandHeld,
+    /// As [`CameraRange::HandHeld`], with a baseline of 0.02 to 0.6 of the median depth with uniform
+    /// logarithm (WMGStereo, arXiv 2504.16930, samples baselines so).
+    LogBaseline,
     /// Pairs of photographs of any kind: field of view 28° to 96° (focal lengths 2 to 0.45
     /// widths), baseline 0.02 to 0.6 of the median depth with uniform logarithm, at most 40° about
     /// each axis. Each view sees at least 30 % of the other.
@@ -51,7 +54,7 @@ impl CameraRange {
     /// Samples a field of view, degrees.
     fn field_of_view(self, rng: &mut Rng) -> f32 {
         match self {
-            Self::HandHeld => rng.range(40.0, 80.0),
+            Self::HandHeld | Self::LogBaseline => rng.range(40.0, 80.0),
             Self::Wide => rng.range(28.0, 96.0),
         }
     }
@@ -60,14 +63,14 @@ impl CameraRange {
     fn baseline(self, rng: &mut Rng) -> f32 {
         match self {
             Self::HandHeld => rng.range(0.05, 0.38),
-            Self::Wide => rng.log_range(0.02, 0.6),
+            Self::LogBaseline | Self::Wide => rng.log_range(0.02, 0.6),
         }
     }
 
     /// Largest rotation between the context views about each axis, degrees.
     fn max_rotation(self) -> f32 {
         match self {
-            Self::HandHeld => 28.0,
+            Self::HandHeld | Self::LogBaseline => 28.0,
             Self::Wide => 40.0,
         }
     }
@@ -75,8 +78,8 @@ impl CameraRange {
     /// Standard deviations of pitch, yaw and roll of the second view, degrees.
     fn rotation_spread(self, orbit: bool) -> [f32; 3] {
         match (self, orbit) {
-            (Self::HandHeld, true) => [1.5, 1.5, 1.0],
-            (Self::HandHeld, false) => [3.0, 7.0, 1.5],
+            (Self::HandHeld | Self::LogBaseline, true) => [1.5, 1.5, 1.0],
+            (Self::HandHeld | Self::LogBaseline, false) => [3.0, 7.0, 1.5],
             (Self::Wide, true) => [3.0, 4.0, 3.0],
             (Self::Wide, false) => [6.0, 12.0, 4.0],
         }
@@ -85,7 +88,7 @@ impl CameraRange {
     /// Smallest share of each context view that the other sees.
     fn min_overlap(self) -> f32 {
         match self {
-            Self::HandHeld => 0.4,
+            Self::HandHeld | Self::LogBaseline => 0.4,
             Self::Wide => 0.3,
         }
     }

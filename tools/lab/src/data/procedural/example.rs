@@ -24,7 +24,12 @@ pub struct ExampleSpec {
     /// Share of examples that show shapes at random places, indoors or outdoors, instead of a
     /// furnished room.
     pub scattered: f32,
-    /// Share of examples with cameras of [`CameraRange::Wide`].
+    /// Share of furnished rooms with objects in the air.
+    pub floating: f32,
+    /// Share of examples with cameras of [`CameraRange::LogBaseline`].
+    pub log_baseline: f32,
+    /// Share of examples with cameras of [`CameraRange::Wide`], which exclude those of
+    /// [`CameraRange::LogBaseline`].
     pub wide: f32,
     /// Samples along each side of a pixel.
     pub samples: usize,
@@ -39,13 +44,14 @@ impl ExampleSpec {
     pub fn new(width: usize, height: usize, targets: usize) -> Self {
         let range = CameraRange::HandHeld;
         let cameras = CameraSpec { width, height, targets, crop: 0.5, range };
-        let (foreground, scattered, wide) = (0.0, 0.0, 0.0);
         Self {
             cameras,
             photographic: true,
-            foreground,
-            scattered,
-            wide,
+            foreground: 0.0,
+            scattered: 0.0,
+            floating: 0.0,
+            log_baseline: 0.0,
+            wide: 0.0,
             samples: 2,
             fine_textures: false,
         }
@@ -94,6 +100,8 @@ const FIXED_PLANES: f32 = 0.7;
 const FOREGROUND: u64 = 12;
 /// Key of the random numbers that choose the kind of scene and of cameras.
 const VARIETY: u64 = 13;
+/// Key of the random numbers for objects in the air and for baselines with uniform logarithm.
+const FLOATING: u64 = 15;
 
 /// Unit of length and depth planes of an example.
 struct Planes {
@@ -137,7 +145,14 @@ impl Example {
             let mut variety = Rng::new(seed).fork(VARIETY);
             let scattered = variety.chance(spec.scattered);
             let wide = variety.chance(spec.wide);
-            let range = if wide { CameraRange::Wide } else { spec.cameras.range };
+            let mut floating = Rng::new(seed).fork(FLOATING);
+            let log_baseline = floating.chance(spec.log_baseline);
+            let floats = floating.chance(spec.floating) && !scattered;
+            let range = match (wide, log_baseline) {
+                (true, _) => CameraRange::Wide,
+                (false, true) => CameraRange::LogBaseline,
+                (false, false) => spec.cameras.range,
+            };
             let mut room = match (scattered, spec.fine_textures) {
                 (true, _) => Room::scattered(seed),
                 (false, true) => Room::with_bank(seed, TextureBank::fine()),
@@ -148,6 +163,9 @@ impl Example {
             {
                 if scattered {
                     room.scatter_objects(&mut rig, &mut variety);
+                }
+                if floats {
+                    room.add_floating(&mut rig, &mut floating);
                 }
                 let mut extra = Rng::new(seed).fork(FOREGROUND);
                 if extra.chance(spec.foreground) {

@@ -1,5 +1,5 @@
 //! Procedural scenes for training and for the shipped example, ray traced: furnished rooms, and
-//! shapes at random places indoors and outdoors (`scatter.rs`).
+//! shapes at random places indoors and outdoors, or in the air of a room (`scatter.rs`).
 //!
 //! Input: a 64-bit seed, pinhole cameras, a resolution. Output: pictures `[H, W, 3]` as display
 //! values in [0, 1], and depth `[H, W]` as camera z of the ray through the pixel's centre, metres.
