@@ -6,6 +6,8 @@
 //! the memory and counts the calls, but executes none.
 //!
 //! `--subgroups` times the kernels with two sources instead, with and without subgroup operations.
+//! `--convolutions` times convolutions of both networks: a line each for `tools/lab/gpu/torch_convolutions.py`,
+//! which adds PyTorch's time.
 
 use anyhow::{Context, Result, bail, ensure};
 use candle_core::{Device, Tensor};
@@ -19,7 +21,7 @@ use subsplat::network::model::weights::Weights;
 use subsplat::network::model::{Backend, Views};
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 use subsplat_kernels::gpu::{
-    Array, FULL_GRID, Gpu, GpuError, NormSum, PointwiseFunction, Recorder, Work,
+    Array, ConvolutionCall, FULL_GRID, Gpu, GpuError, NormSum, PointwiseFunction, Recorder, Work,
 };
 
 /// Class of adapters, its f32 rate in flop/s, and its memory's rate in bytes/s (data sheets).
@@ -43,6 +45,7 @@ struct Args {
     device: String,
     count: bool,
     subgroups: bool,
+    convolutions: bool,
 }
 
 fn parse() -> Result<Args> {
@@ -52,6 +55,7 @@ fn parse() -> Result<Args> {
         device: "gpu".to_owned(),
         count: false,
         subgroups: false,
+        convolutions: false,
     };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
@@ -60,6 +64,7 @@ fn parse() -> Result<Args> {
             "--bench" => {}
             "--count" => args.count = true,
             "--subgroups" => args.subgroups = true,
+            "--convolutions" => args.convolutions = true,
             "--side" => args.side = value()?.parse().context("--side")?,
             "--device" => args.device = value()?,
             other if other.starts_with('-') => bail!("unknown option {other}"),
@@ -220,10 +225,58 @@ fn report_subgroups() -> Result<()> {
     Ok(())
 }
 
+/// Convolutions of two pictures of 256²: batch, channels in, height, width, channels out, side of the
+/// kernel, stride.
+const CONVOLUTIONS: [[usize; 7]; 8] = [
+    [2, 3, 256, 256, 64, 7, 2],
+    [2, 64, 128, 128, 64, 3, 1],
+    [2, 96, 64, 64, 96, 3, 1],
+    [2, 128, 64, 64, 128, 3, 1],
+    [2, 64, 64, 64, 80, 3, 2],
+    [2, 128, 64, 64, 128, 1, 1],
+    [2, 32, 256, 256, 32, 3, 1],
+    [2, 288, 64, 64, 128, 3, 1],
+];
+
+/// Prints the time of each convolution, forward, without a bias.
+fn report_convolutions(args: &Args) -> Result<()> {
+    let backend = Backend::open(&args.device)?;
+    let gpu = backend.gpu().context("--device: expected a GPU, got the CPU")?.clone();
+    println!("# batch in height width out kernel stride ms GFLOP/s, {}", gpu.adapter());
+    let recorder = Recorder::new(gpu);
+    let numbers = |n: usize| (0..n).map(|i| (i as f32 * 0.37).sin()).collect::<Vec<_>>();
+    let upload = |dims: &[usize]| recorder.upload(&numbers(dims.iter().product()), dims);
+    for [b, c, h, w, o, k, stride] in CONVOLUTIONS {
+        let (x, weight) = (upload(&[b, c, h, w])?, upload(&[o, c, k, k])?);
+        let call = ConvolutionCall { stride, padding: k / 2 };
+        let run = || x.convolved(&weight, None, call, PointwiseFunction::None);
+        let mut best = f64::INFINITY;
+        for _ in 0..=REPEATS {
+            recorder.finish()?;
+            let start = Instant::now();
+            for _ in 0..CALLS {
+                run()?;
+            }
+            recorder.finish()?;
+            best = best.min(start.elapsed().as_secs_f64() / CALLS as f64);
+        }
+        let flops = 2 * b * o * c * k * k * (h / stride) * (w / stride);
+        println!(
+            "{b} {c} {h} {w} {o} {k} {stride} {:.4} {:.0}",
+            1e3 * best,
+            flops as f64 / best / 1e9
+        );
+    }
+    Ok(())
+}
+
 fn main() -> Result<()> {
     let args = parse()?;
     if args.subgroups {
         return report_subgroups();
+    }
+    if args.convolutions {
+        return report_convolutions(&args);
     }
     let all = [
         ("small", Weights::shipped(2)?.config().context("the weights' configuration")?.clone()),
