@@ -168,7 +168,8 @@ impl<'a> Surface<'a> {
             across = along;
         }
         let m = self.mean(patch.centre, patch.depth);
-        [m.x, m.y, m.z, q.w, q.x, q.y, q.z, across, along, ray, OPACITY]
+        // Equal cameras give equal bytes: a zero of either sign becomes +0.
+        [m.x, m.y, m.z, q.w, q.x, q.y, q.z, across, along, ray, OPACITY].map(|v| v + 0.0)
     }
 }
 

