@@ -152,7 +152,7 @@ impl RefineOptions {
     pub fn needs_fit(&self, photographs: usize) -> bool {
         /// Steps of the scenes above, less a quarter.
         const STEPS: usize = 30;
-        photographs < 3 || self.steps < STEPS
+        photographs < 3 || self.steps < STEPS || self.time.is_some()
     }
 }
 

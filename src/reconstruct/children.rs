@@ -249,7 +249,7 @@ mod tests {
     use crate::finish::FitOptions;
     use crate::network::config::{Config, Preset};
     use crate::reconstruct::{
-        Check, DepthRange, Options, Photo, Reconstruction, Reconstructor, Refine,
+        Check, DepthRange, Options, Photo, Reconstruction, Reconstructor, Refine, Surroundings,
     };
     use crate::scene::mask::Mask;
     use crate::scene::pictures::Rgb;
@@ -309,6 +309,7 @@ mod tests {
             .with_check(Check::Off)
             .with_depth_range(DepthRange::Fixed { near: 1.0, far: 6.0 })
             .with_density(density)
+            .with_surroundings(Surroundings::Off)
             .with_fit(FitOptions::default().with_steps(steps))
             .with_refine(Refine::Steps(steps));
         model.run(photos, &options).unwrap()
