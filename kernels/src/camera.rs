@@ -350,6 +350,11 @@ impl Camera {
         (p.z > 0.0).then(|| self.intrinsics.project(p))
     }
 
+    /// Returns the world point at camera z `depth` on the ray of a pixel position.
+    pub fn unproject(&self, px: Vec2, depth: f32) -> Vec3 {
+        self.world_from_camera.transform_point3(self.intrinsics.unproject(px) * depth)
+    }
+
     /// Returns the same pose with the intrinsics of a picture resampled to `width` × `height`.
     ///
     /// # Errors

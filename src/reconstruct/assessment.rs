@@ -27,8 +27,6 @@ const SOURCES: usize = 2;
 const CONSISTENT: f32 = 0.005;
 /// One of so many points measures the parallax.
 const PARALLAX_STEP: usize = 17;
-/// Least alpha of a pixel whose depth counts.
-const OPAQUE: f32 = 0.5;
 
 /// Agreement of the photographs over the scene's surface, means over pairs of photographs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -88,8 +86,7 @@ impl<'a> Surface<'a> {
         let depth = |i: usize| {
             let at =
                 (i / grid.width * step + step / 2) * size.width + i % grid.width * step + step / 2;
-            let kept = mask.is_none_or(|mask| mask.kept().get(at) != Some(&false));
-            if kept && picture.alpha[at] >= OPAQUE { picture.depth[at] } else { 0.0 }
+            picture.surface_depth(at, mask)
         };
         let depth = (0..grid.width * grid.height).map(depth).collect();
         Self { camera: input.target_camera, photograph: &input.target, grid, depth }
@@ -118,12 +115,6 @@ impl<'a> Surface<'a> {
         let (x, y) = (share.x * self.grid.width as f32, share.y * self.grid.height as f32);
         let depth = self.depth[y as usize * self.grid.width + x as usize];
         (depth > 0.0).then_some(depth)
-    }
-
-    /// World position of the surface at a place of the picture.
-    fn point(&self, at: Vec2, depth: f32) -> Vec3 {
-        let ray = self.camera.intrinsics().unproject(at);
-        self.camera.world_from_camera().transform_point3(ray * depth)
     }
 
     /// Colour at a place of the picture, between the four nearest pixels.
@@ -158,10 +149,10 @@ fn compare(from: &Surface<'_>, to: &Surface<'_>, i: usize) -> Option<Shared> {
         return None;
     }
     let at = from.place(i);
-    let point = from.point(at, depth);
+    let point = from.camera.unproject(at, depth);
     let there = to.camera.project(point)?;
     let other = to.depth_at(there)?;
-    let back = from.camera.project(to.point(there, other));
+    let back = from.camera.project(to.camera.unproject(there, other));
     let width = from.size().x;
     let colour = from.colour(at);
     let difference = |other: Vec3| f64::from((colour - other).length_squared());
@@ -191,7 +182,7 @@ fn parallax(surfaces: &[Surface<'_>]) -> f32 {
     let mut all = Vec::new();
     for (i, from) in surfaces.iter().enumerate() {
         for p in (0..from.depth.len()).step_by(PARALLAX_STEP).filter(|&p| from.depth[p] > 0.0) {
-            let point = from.point(from.place(p), from.depth[p]);
+            let point = from.camera.unproject(from.place(p), from.depth[p]);
             let others = surfaces.iter().enumerate().filter(|(j, _)| *j != i);
             let of = |(_, to): (usize, &Surface<'_>)| displacement(&from.camera, &to.camera, point);
             all.push(others.map(of).fold(0.0, f32::max));
@@ -273,8 +264,7 @@ mod tests {
         let mut data = Vec::new();
         for i in 0..SIDE * SIDE {
             let at = Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5);
-            let ray = camera.intrinsics().unproject(at) * 2.0;
-            let p = camera.world_from_camera().transform_point3(ray);
+            let p = camera.unproject(at, 2.0);
             let wave = |f: f32| (127.0 + 120.0 * (f * p.x + 0.3 * f * p.y).sin()) as u8;
             data.extend([wave(9.0), wave(13.0), wave(17.0)]);
         }

@@ -39,11 +39,16 @@ pub enum Density {
 }
 
 impl Density {
+    /// Returns whether a scene may have Gaussians beside those of the pixels, because the caller gives no number.
+    pub fn has_room(self) -> bool {
+        matches!(self, Self::Auto | Self::Full)
+    }
+
     /// Returns whether each of `parents` parents of `photographs` photographs has r² children,
     /// r = `upscale`.
     pub(crate) fn is_full(self, parents: usize, photographs: usize, upscale: usize) -> bool {
         let full = parents.saturating_mul(upscale * upscale);
-        matches!(self, Self::Auto | Self::Full) && self.limit(parents, photographs, upscale) == full
+        self.has_room() && self.limit(parents, photographs, upscale) == full
     }
 
     /// Returns the largest number of Gaussians for `parents` of `photographs` photographs and

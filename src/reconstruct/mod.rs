@@ -75,8 +75,7 @@ pub use estimate_cameras::{
 };
 pub use input_size::InputSize;
 pub use options::{
-    Check, Detail, Matching, Options, Poses, Quality, QualitySettings, Refine, Surroundings,
-    TargetSize,
+    Check, Detail, Matching, Options, Poses, Quality, QualitySettings, Refine, TargetSize,
 };
 pub use photo::{Photo, Photographs};
 pub use poses::PoseError;
@@ -85,6 +84,7 @@ pub use progress::{Progress, Stage, StageTime};
 pub use projections::{FisheyeCurve, FisheyeLens, Projection};
 pub use reconstruction::Reconstruction;
 pub use reconstructor::Reconstructor;
+pub use surroundings::Surroundings;
 pub use verdict::{SceneVerdict, Trust};
 pub use warning::Warning;
 
@@ -92,7 +92,7 @@ pub(crate) use children::{SceneChildren, counts_of};
 pub(crate) use coarse_to_fine::{match_parents, options_of_parents, refine_parents};
 pub(crate) use finishing::{check_refine, fit_to_inputs, refine_on_inputs};
 pub(crate) use poses::check_pairs;
-pub(crate) use surroundings::{add_surroundings, remove_surroundings};
+pub(crate) use surroundings::{add_surroundings, restore_surroundings, take_surroundings};
 
 /// The stages of a run, one by one, for evaluation. No version promises anything about them.
 pub mod stages {
@@ -102,7 +102,7 @@ pub mod stages {
     pub use super::equal_exposure::equalise;
     pub use super::finishing::{fit_to_inputs, refine_on_inputs};
     pub use super::poses::{adjusted, adjusted_if_doubted, check_pairs, located};
-    pub use super::surroundings::{add_surroundings, remove_surroundings};
+    pub use super::surroundings::add_surroundings;
     pub use crate::finish::Groups;
 }
 

@@ -1,6 +1,6 @@
 //! Options of a reconstruction.
 
-use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result};
+use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result, Surroundings};
 use crate::finish::{FitOptions, RefineOptions};
 use std::fmt;
 use std::time::Duration;
@@ -209,9 +209,8 @@ impl Options {
 
     /// Returns whether Gaussians are added where no photograph shows the scene.
     pub(super) fn has_surroundings(&self) -> bool {
-        let has_room = matches!(self.density, Density::Auto | Density::Full);
         let wanted = self.surroundings == Surroundings::Photographs;
-        wanted && has_room && !self.keeps_the_networks()
+        wanted && self.density.has_room() && !self.keeps_the_networks()
     }
 
     /// Options of the refinement for a number of photographs.
@@ -495,19 +494,6 @@ pub enum Matching {
     #[default]
     Photographs,
     /// The network's own depth.
-    Off,
-}
-
-/// Gaussians beyond the edges of the photographs, so that new views from beside them have no strips of the
-/// background's colour.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Surroundings {
-    /// In the colours and depths of the pixels at the edges, about 1 % more Gaussians. None where the caller gives
-    /// their number ([`Options::density`]), or where neither [`Options::fit`] nor [`Options::refine`] changes them.
-    #[default]
-    Photographs,
-    /// None.
     Off,
 }
 

@@ -2,7 +2,7 @@
 
 use super::{
     DepthBounds, Detail, Refine, Result, StageTime, Warning, add_surroundings, refine_on_inputs,
-    remove_surroundings,
+    restore_surroundings, take_surroundings,
 };
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
@@ -90,15 +90,19 @@ impl Reconstruction {
     ) -> Result<RefineReport> {
         let Self { splats, surroundings, groups, inputs, raster_options: raster, fit, .. } = self;
         let options = refine.options_for(inputs.len(), fit.is_some());
-        let mut bare = splats.clone();
-        remove_surroundings(&mut bare, *surroundings);
-        let report =
-            refine_on_inputs(&mut bare, groups, inputs, raster, &options, renderer, progress)?;
+        let taken = take_surroundings(splats, *surroundings);
+        let done = refine_on_inputs(splats, groups, inputs, raster, &options, renderer, progress);
+        let report = match done {
+            Ok(report) => report,
+            Err(e) => {
+                restore_surroundings(splats, taken);
+                return Err(e);
+            }
+        };
         if *surroundings > 0 {
             // The rules for pictures of the inputs' size differ in the low-pass alone, which is below a pixel.
-            *surroundings = add_surroundings(&mut bare, inputs, raster, renderer);
+            *surroundings = add_surroundings(splats, inputs, raster, renderer);
         }
-        *splats = bare;
         self.refinement = Some(report);
         Ok(report)
     }

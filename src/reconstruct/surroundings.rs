@@ -20,7 +20,20 @@ use rayon::prelude::*;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, gain_with_offsets};
 
-/// Sides of a photograph's shorter side over the width of the innermost ring.
+/// Gaussians beyond the edges of the photographs, so that new views from beside them have no strips of the
+/// background's colour.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Surroundings {
+    /// In the colours and depths of the pixels at the edges, about 1 % more Gaussians. None where the caller gives
+    /// their number ([`Options::density`](super::Options::density)), or where neither [`Options::fit`](super::Options::fit) nor [`Options::refine`](super::Options::refine) changes them.
+    #[default]
+    Photographs,
+    /// None.
+    Off,
+}
+
+/// A photograph's shorter side over the width of the innermost ring.
 const FINEST: f32 = 128.0;
 /// Rings of a photograph.
 const RINGS: usize = 5;
@@ -34,8 +47,6 @@ const REACH: f32 = 2.0;
 const FARTHER: f32 = 1.05;
 /// Opacity.
 const OPACITY: f32 = 0.95;
-/// Least alpha of a pixel whose depth counts.
-const OPAQUE: f32 = 0.5;
 
 /// A photograph with the depth of the scene at its pixels.
 struct Surface<'a> {
@@ -71,10 +82,8 @@ impl<'a> Surface<'a> {
     ) -> Self {
         let camera = photograph.input_camera;
         let picture = renderer.render(splats, &camera, raster);
-        let kept = photograph.input_mask.as_ref().map(|mask| mask.kept());
-        let depth = picture.depth.iter().zip(&picture.alpha).enumerate().map(|(i, (z, alpha))| {
-            if *alpha >= OPAQUE && kept.is_none_or(|kept| kept[i]) { *z } else { 0.0 }
-        });
+        let mask = photograph.input_mask.as_ref();
+        let depth = (0..picture.depth.len()).map(|i| picture.surface_depth(i, mask));
         Self { depth: depth.collect(), camera, photograph }
     }
 
@@ -139,12 +148,6 @@ impl<'a> Surface<'a> {
         patches
     }
 
-    /// The point at camera z `depth` behind a pixel position, world frame.
-    fn mean(&self, px: Vec2, depth: f32) -> Vec3 {
-        let in_camera = self.camera.intrinsics().unproject(px) * depth;
-        self.camera.world_from_camera().transform_point3(in_camera)
-    }
-
     /// Returns whether this photograph shows a part of the Gaussian around `mean` with the largest σ `sigma` (world
     /// units), or what hides it.
     fn shows(&self, mean: Vec3, sigma: f32) -> bool {
@@ -167,7 +170,7 @@ impl<'a> Surface<'a> {
         if patch.is_corner {
             across = along;
         }
-        let m = self.mean(patch.centre, patch.depth);
+        let m = self.camera.unproject(patch.centre, patch.depth);
         // Equal cameras give equal bytes: a zero of either sign becomes +0.
         [m.x, m.y, m.z, q.w, q.x, q.y, q.z, across, along, ray, OPACITY].map(|v| v + 0.0)
     }
@@ -230,13 +233,23 @@ pub fn add_surroundings(
     found.len()
 }
 
-/// Removes the last `number` Gaussians, which [`add_surroundings`] added.
-pub fn remove_surroundings(splats: &mut Splats, number: usize) {
+/// Removes the last `number` Gaussians, which [`add_surroundings`] added, and returns them.
+pub fn take_surroundings(splats: &mut Splats, number: usize) -> Splats {
     let (children, channels) = (splats.children_per_parent().max(1), splats.gain_channels());
     let left = splats.len().saturating_sub(number);
-    splats.rows.truncate(left * SPLAT_STRIDE);
-    splats.gain.truncate(left * channels);
-    splats.sh.truncate(left / children * 3 * splats.sh_coefficients());
+    Splats {
+        rows: splats.rows.split_off(left * SPLAT_STRIDE),
+        sh: splats.sh.split_off(left / children * 3 * splats.sh_coefficients()),
+        gain: splats.gain.split_off(left * channels),
+        ..*splats
+    }
+}
+
+/// Adds Gaussians that [`take_surroundings`] removed.
+pub fn restore_surroundings(splats: &mut Splats, taken: Splats) {
+    splats.rows.extend(taken.rows);
+    splats.sh.extend(taken.sh);
+    splats.gain.extend(taken.gain);
 }
 
 #[cfg(test)]
@@ -329,9 +342,13 @@ mod tests {
                     assert!((a.rgb[3 * i] - b.rgb[3 * i]).abs() < 0.02, "{i}");
                 }
             }
-            remove_surroundings(&mut splats, number);
+            let whole = splats.clone();
+            let taken = take_surroundings(&mut splats, number);
+            assert_eq!(taken.len(), number);
             assert_eq!((&splats.rows, &splats.sh), (&bare.rows, &bare.sh));
             assert_eq!(splats.gain, gain_with_offsets(&bare.gain, bare.len()));
+            restore_surroundings(&mut splats, taken);
+            assert_eq!(splats, whole);
         }
     }
 

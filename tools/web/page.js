@@ -35,7 +35,7 @@ let viewer = null;
 let photographs = [];
 /** The scene that is shown: its .spz and the viewer's settings. */
 let finished = null;
-/** Whether the viewer shows a scene of the reconstruction that runs, and the end of its last change. */
+/** The viewer shows a scene of the reconstruction that runs; the end of its last change. */
 let isShown = false, showing = Promise.resolve();
 
 function stopWorker(reason) {

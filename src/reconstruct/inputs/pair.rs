@@ -72,7 +72,7 @@ fn overlap_in(a: &Camera, b: &Camera, near: f32, far: f32) -> f32 {
         let depth = near * (far / near).powf((d as f32 + 0.5) / DEPTHS as f32);
         for i in 0..GRID * GRID {
             let at = Vec2::new((i % GRID) as f32 + 0.5, (i / GRID) as f32 + 0.5) / GRID as f32;
-            let point = a.world_from_camera().transform_point3(from.unproject(at * size) * depth);
+            let point = a.unproject(at * size, depth);
             let inside = b.project(point).is_some_and(|p| {
                 p.x >= 0.0 && p.y >= 0.0 && p.x <= to.width as f32 && p.y <= to.height as f32
             });

@@ -44,27 +44,9 @@ pub fn named(file: String, camera: Camera) -> NamedCamera {
 fn example() -> &'static Example {
     static EXAMPLE: OnceLock<Example> = OnceLock::new();
     EXAMPLE.get_or_init(|| {
-        let cameras = CameraSpec {
-            width: SIDE,
-            height: SIDE,
-            targets: 1,
-            crop: 0.0,
-            range: Default::default(),
-        };
-        Example::new(
-            3,
-            &ExampleSpec {
-                cameras,
-                photographic: false,
-                foreground: 0.0,
-                scattered: 0.0,
-                floating: 0.0,
-                log_baseline: 0.0,
-                wide: 0.0,
-                samples: 1,
-                fine_textures: false,
-            },
-        )
+        let spec = ExampleSpec::new(SIDE, SIDE, 1);
+        let cameras = CameraSpec { crop: 0.0, ..spec.cameras };
+        Example::new(3, &ExampleSpec { cameras, photographic: false, samples: 1, ..spec })
     })
 }
 

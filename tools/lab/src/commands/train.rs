@@ -37,7 +37,7 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let mut peers = peers::connect()?;
     // Rank 0 keeps the records of a shared training.
     let first = peers.ranks().rank == 0;
-    // What one rank cannot read or write ends all of them.
+    // A file that one rank cannot read or write ends all of them.
     let config = agree(&mut *peers, TrainConfig::load(&args.config))?;
     let stop = stop_on_interrupt()?;
     let limits = Limits { minutes: args.minutes, steps: args.steps, stop: Some(&stop) };

@@ -15,7 +15,7 @@ use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::inputs::crop::{Cropped, PhotoWindow};
 use subsplat::reconstruct::stages::{
     SceneChildren, add_surroundings, counts_of, fit_to_inputs, match_parents, options_of_parents,
-    refine_on_inputs, refine_parents, remove_surroundings,
+    refine_on_inputs, refine_parents,
 };
 use subsplat::reconstruct::{
     Density, DepthBounds, DepthRange, Error, Reconstructor, Refine, Result,
@@ -42,8 +42,6 @@ pub(super) struct PictureMaker<'a> {
     /// The set that `splats` holds.
     current: Option<Set>,
     splats: Option<SceneChildren>,
-    /// The last of them, which lie where no photograph shows the scene.
-    surroundings: usize,
     rasterizer: Rasterizer,
     /// Mean alpha of the last rendered picture.
     coverage: f64,
@@ -193,7 +191,6 @@ impl<'a> PictureMaker<'a> {
             refine: options.refine,
             current: None,
             splats: None,
-            surroundings: 0,
             rasterizer: Rasterizer::new(),
             coverage: 0.0,
             network_seconds: begin.elapsed().as_secs_f64(),
@@ -232,15 +229,7 @@ impl<'a> PictureMaker<'a> {
         let place = |set: Set| IN_ORDER.iter().position(|s| *s == set);
         let mut before = 0.0;
         let (from, to) = (self.current.and_then(place), place(set));
-        let mut surroundings = 0;
-        let mut splats = match (from, to, self.splats.take()) {
-            (None, None, Some(mut surrounded))
-                if set == Set::Bare && self.current == Some(Set::Refined(Parents::Matched)) =>
-            {
-                before = self.set_seconds;
-                remove_surroundings(&mut surrounded.splats, self.surroundings);
-                surrounded
-            }
+        let splats = match (from, to, self.splats.take()) {
             (Some(from), Some(to), Some(splats)) if from < to => {
                 before = self.set_seconds;
                 let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
@@ -258,7 +247,9 @@ impl<'a> PictureMaker<'a> {
             (_, None, _) => match set {
                 Set::Refined(parents) => {
                     let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
-                    self.finished(network, at, parents)?
+                    let mut children = self.finished(network, at, parents)?;
+                    self.surround(network, &crops.inputs, &mut children);
+                    children
                 }
                 Set::Bare => {
                     let at = (network.model.model(), crops.inputs.as_slice(), self.upscale);
@@ -269,12 +260,6 @@ impl<'a> PictureMaker<'a> {
                 set => SceneChildren::of_splats(self.baseline(network, crops, set)?),
             },
         };
-        if matches!(set, Set::Refined(_) | Set::Smaller(_) | Set::Pair(_)) {
-            let raster = self.raster_options(network, 1.0, None);
-            let (splats, inputs) = (&mut splats.splats, &crops.inputs);
-            surroundings = add_surroundings(splats, inputs, &raster, &mut Renderer::default());
-        }
-        self.surroundings = surroundings;
         self.set_seconds = before + begin.elapsed().as_secs_f64();
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())
@@ -327,12 +312,16 @@ impl<'a> PictureMaker<'a> {
         smaller: Smaller,
     ) -> Result<SceneChildren> {
         let ratio = smaller.ratio(self.upscale);
-        if !network.model.config().spgr.head.serves_any_k() {
-            return Ok(SceneChildren::of_splats(self.refined_parents(network, crops)?));
-        }
-        let model = network.model.model().clone().with_upscale(ratio.ceil() as usize)?;
-        let inputs = crops.inputs.iter().map(|c| reduced(c, ratio)).collect::<Result<Vec<_>>>()?;
-        self.finished(network, (&model, &inputs, ratio), Parents::Matched)
+        let mut children = if network.model.config().spgr.head.serves_any_k() {
+            let model = network.model.model().clone().with_upscale(ratio.ceil() as usize)?;
+            let inputs = crops.inputs.iter().map(|c| reduced(c, ratio));
+            let inputs = inputs.collect::<Result<Vec<_>>>()?;
+            self.finished(network, (&model, &inputs, ratio), Parents::Matched)?
+        } else {
+            SceneChildren::of_splats(self.refined_parents(network, crops)?)
+        };
+        self.surround(network, &crops.inputs, &mut children);
+        Ok(children)
     }
 
     /// The Gaussians that `run` makes of two of the inputs.
@@ -345,7 +334,19 @@ impl<'a> PictureMaker<'a> {
         let inputs = pair.map(|i| crops.inputs[i].clone());
         let bounds = crops.bounds.clone();
         let (network, _) = Network::new(model, &inputs, bounds, crops.depth_range)?;
-        self.finished(&network, (model.model(), &inputs, self.upscale), Parents::Matched)
+        let at = (model.model(), inputs.as_slice(), self.upscale);
+        let mut children = self.finished(&network, at, Parents::Matched)?;
+        self.surround(&network, &inputs, &mut children);
+        Ok(children)
+    }
+
+    /// Adds the Gaussians beyond the edges of `inputs`, as `run` does.
+    fn surround(&self, network: &Network<'_>, inputs: &[Cropped], children: &mut SceneChildren) {
+        if self.density.has_room() {
+            let raster = self.raster_options(network, 1.0, None);
+            let renderer = &mut Renderer::default();
+            add_surroundings(&mut children.splats, inputs, &raster, renderer);
+        }
     }
 
     /// The network's Gaussians, one a pixel, matched, and refined on the photographs of the input's size.
@@ -361,7 +362,7 @@ impl<'a> PictureMaker<'a> {
         Ok(parents)
     }
 
-    /// The Gaussians that `run` makes, of `parents`, by a model and for `inputs`, whose targets have
+    /// The Gaussians that `run` makes, without those beyond the edges, of `parents`, by a model and for `inputs`, whose targets have
     /// `ratio` times their side.
     fn finished(
         &self,

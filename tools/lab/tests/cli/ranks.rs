@@ -108,7 +108,7 @@ fn ranks_end_together() {
     assert!(!folder.path().join("exchange").exists());
 }
 
-/// What one rank cannot do ends all ranks with its error.
+/// The error of one rank ends all ranks.
 #[test]
 fn a_rank_that_fails_ends_all() {
     let config = tiny("depth");

@@ -181,18 +181,13 @@ impl Session {
 
     fn describe(&self) -> Result<Vec<u8>, String> {
         let scene = self.scene()?;
-        Ok(bytes(&json!({
-            "gaussians": scene.splats.len(),
-            "background": scene.options.background,
-            "cameras": scene.cameras.iter().map(named_camera).collect::<Vec<_>>(),
-            "photographs": true,
-            "verdict": scene.verdict,
-            "warnings": scene.warnings,
-            "network": {
-                "processor": scene.network.processor,
-                "reason": scene.network.reason,
-            },
-        })))
+        let mut description = views(&scene.options, &scene.cameras);
+        description["gaussians"] = json!(scene.splats.len());
+        description["verdict"] = json!(scene.verdict);
+        description["warnings"] = json!(scene.warnings);
+        let Network { processor, reason } = &scene.network;
+        description["network"] = json!({ "processor": processor, "reason": reason });
+        Ok(bytes(&description))
     }
 
     pub(crate) fn save(&self, extension: &[u8]) -> Result<Vec<u8>, String> {
@@ -205,13 +200,18 @@ impl Session {
     }
 }
 
-/// Description and .spz of a scene that is being refined; `None` where it cannot be encoded.
-fn so_far(scene: &SceneSoFar<'_>, cameras: &[(String, Camera)]) -> Option<[Vec<u8>; 2]> {
-    let description = bytes(&json!({
-        "background": scene.raster_options().background,
+/// Description of a scene as the viewer reads it: its background, and the photographs' own cameras.
+fn views(options: &RasterOptions, cameras: &[(String, Camera)]) -> Value {
+    json!({
+        "background": options.background,
         "cameras": cameras.iter().map(named_camera).collect::<Vec<_>>(),
         "photographs": true,
-    }));
+    })
+}
+
+/// Description and .spz of a scene that is being refined; `None` where it cannot be encoded.
+fn so_far(scene: &SceneSoFar<'_>, cameras: &[(String, Camera)]) -> Option<[Vec<u8>; 2]> {
+    let description = bytes(&views(&scene.raster_options(), cameras));
     let spz = encode_splats(SplatFormat::Spz, &scene.splats(), &SaveOptions::default()).ok()?;
     Some([description, spz])
 }
