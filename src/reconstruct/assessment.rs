@@ -9,6 +9,7 @@
 use super::{Error, Reconstruction, Result, SceneVerdict};
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::reconstruct::inputs::pair::choose_sources;
+use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use crate::scene::render::{Picture, Renderer};
 use crate::scene::score::Score;
@@ -27,6 +28,8 @@ const SOURCES: usize = 2;
 const CONSISTENT: f32 = 0.005;
 /// One of so many points measures the parallax.
 const PARALLAX_STEP: usize = 17;
+/// Least alpha of a pixel whose depth counts.
+const OPAQUE: f32 = 0.5;
 
 /// Agreement of the photographs over the scene's surface, means over pairs of photographs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -67,6 +70,13 @@ pub struct Assessment {
     pub verdict: SceneVerdict,
 }
 
+/// Camera z of the surface at pixel `i` of `picture`; 0 where the picture is not opaque enough, or where `mask` leaves
+/// the pixel out.
+pub(super) fn surface_depth(picture: &Picture, i: usize, mask: Option<&Mask>) -> f32 {
+    let kept = mask.is_none_or(|mask| mask.kept().get(i) != Some(&false));
+    if kept && picture.alpha[i] >= OPAQUE { picture.depth[i] } else { 0.0 }
+}
+
 /// Depths of a picture on a grid.
 struct Surface<'a> {
     camera: Camera,
@@ -86,7 +96,7 @@ impl<'a> Surface<'a> {
         let depth = |i: usize| {
             let at =
                 (i / grid.width * step + step / 2) * size.width + i % grid.width * step + step / 2;
-            picture.surface_depth(at, mask)
+            surface_depth(picture, at, mask)
         };
         let depth = (0..grid.width * grid.height).map(depth).collect();
         Self { camera: input.target_camera, photograph: &input.target, grid, depth }

@@ -12,6 +12,7 @@
 //! scene's own Gaussians show beyond the edges; strips of the same widths behind the edges of near objects, where
 //! the farther surface goes on, 18.77 / .681 and 27.68 / .925: they shine through surfaces that are not quite opaque.
 
+use super::assessment::surface_depth;
 use crate::reconstruct::inputs::crop::Cropped;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
@@ -83,7 +84,7 @@ impl<'a> Surface<'a> {
         let camera = photograph.input_camera;
         let picture = renderer.render(splats, &camera, raster);
         let mask = photograph.input_mask.as_ref();
-        let depth = (0..picture.depth.len()).map(|i| picture.surface_depth(i, mask));
+        let depth = (0..picture.depth.len()).map(|i| surface_depth(&picture, i, mask));
         Self { depth: depth.collect(), camera, photograph }
     }
 

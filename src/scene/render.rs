@@ -11,14 +11,10 @@ pub use comment::{
 };
 pub use device::{DeviceError, Renderer};
 
-use crate::scene::mask::Mask;
 use crate::scene::splats::Splats;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::cpu::{Geometry, Rasterizer, SplatSlices};
 use subsplat_kernels::layout::{RasterOptions, Rendered};
-
-/// Least alpha of a pixel whose depth is that of a surface.
-const OPAQUE: f32 = 0.5;
 
 /// A rendered view, H × W pixels, row-major, top row first.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -34,15 +30,6 @@ pub struct Picture {
     pub alpha: Vec<f32>,
     /// `[H, W]`: expected camera z, Σ w·z / alpha, world units; 0 where alpha is 0.
     pub depth: Vec<f32>,
-}
-
-impl Picture {
-    /// Camera z of the surface at pixel `i`; 0 where the picture is not opaque enough, or where `mask` leaves
-    /// the pixel out.
-    pub(crate) fn surface_depth(&self, i: usize, mask: Option<&Mask>) -> f32 {
-        let kept = mask.is_none_or(|mask| mask.kept().get(i) != Some(&false));
-        if kept && self.alpha[i] >= OPAQUE { self.depth[i] } else { 0.0 }
-    }
 }
 
 /// Renders `splats` as seen by `camera`, on the CPU.
