@@ -11,6 +11,7 @@ use super::removal::{Groups, pruned};
 use super::targets::{MaskedView, Target, TargetView, beyond, by_planes, pixel_sizes, whole};
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
+use std::cell::Cell;
 use std::ops::{ControlFlow, Range};
 use std::time::Duration;
 use subsplat_kernels::clock::{HAS_CLOCK, Instant};
@@ -35,6 +36,22 @@ pub struct PhaseRun<'a> {
     /// Rows of the Gaussians that a step draws, where it leaves some out.
     drawn: Vec<f32>,
     step: usize,
+    /// Set by [`PhaseRun::end`].
+    end: Cell<Option<End>>,
+}
+
+/// Least and largest number of steps after [`PhaseRun::end`]: one round of the photographs, within these.
+const END_STEPS: [usize; 2] = [8, 16];
+
+/// Steps of a phase that a caller ends.
+#[derive(Clone, Copy)]
+struct End {
+    /// Steps before the last ones.
+    begin: usize,
+    /// Number of the last ones.
+    steps: usize,
+    /// [`PhaseRun::progress`] before them.
+    at: f32,
 }
 
 /// Result of a phase.
@@ -105,6 +122,7 @@ impl<'a> PhaseRun<'a> {
             gradients,
             drawn: Vec::new(),
             step: 0,
+            end: Cell::new(None),
         })
     }
 
@@ -116,6 +134,15 @@ impl<'a> PhaseRun<'a> {
     /// The Gaussians after the steps so far.
     pub fn splats(&self) -> Splats {
         self.optimiser.splats()
+    }
+
+    /// Ends the steps of a whole phase ([`refine`](super::refine())) that shows itself to its caller, after one more
+    /// round of the photographs, in which the rates fall to their end: steps at high rates leave noise.
+    pub fn end(&self) {
+        if self.end.get().is_none() {
+            let rounds = self.targets.len().clamp(END_STEPS[0], END_STEPS[1]);
+            self.end.set(Some(End { begin: self.step, steps: rounds, at: self.progress() }));
+        }
     }
 
     /// Takes one step. Does nothing without photographs or Gaussians.
@@ -142,7 +169,7 @@ impl<'a> PhaseRun<'a> {
         }
         let other = self.add_gradients(last, renderer);
         self.step += 1;
-        let factor = self.phase.schedule.factor(self.progress());
+        let factor = self.phase.schedule.factor(self.course());
         let gradients = gradients_of(&self.gradients, &self.across, other, &self.phase);
         self.optimiser.step(&gradients, factor);
     }
@@ -194,9 +221,17 @@ impl<'a> PhaseRun<'a> {
         part.clamp(0.0, 1.0)
     }
 
-    /// Returns whether the limit of steps or of time is reached.
+    /// Place in the course of the rates, 0 to 1.
+    fn course(&self) -> f32 {
+        let Some(end) = self.end.get() else { return self.progress() };
+        let part = (self.step - end.begin) as f32 / end.steps as f32;
+        end.at + (1.0 - end.at) * part.min(1.0)
+    }
+
+    /// Returns whether the limit of steps or of time is reached, or the caller ended the steps.
     fn is_done(&self) -> bool {
-        self.step >= self.phase.steps || self.progress() >= 1.0
+        let ended = self.end.get().is_some_and(|end| self.step >= end.begin + end.steps);
+        ended || self.step >= self.phase.steps || self.progress() >= 1.0
     }
 
     /// The measure of the phase ([`RefineReport`](super::RefineReport)): mean over the photographs.

@@ -116,7 +116,8 @@ pub fn options_of_parents(scene: &RefineOptions, inputs: &[Cropped]) -> Option<R
 
 /// Fits and refines `parents` on the photographs of the input's size, which `raster` renders, by
 /// [`options_of_parents`]. Those that the photographs hardly show, and those of masked pixels, become transparent
-/// instead, and get no children. `progress` receives the share that is done.
+/// instead, and get no children. `progress` receives the refinement after each step, and `None` after each step of
+/// the fit.
 ///
 /// # Errors
 /// [`Error::Cancelled`].
@@ -126,7 +127,7 @@ pub fn refine_parents(
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(f32) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(Option<&PhaseRun<'_>>) -> ControlFlow<()>,
 ) -> Result<()> {
     let views = finishing::input_views(inputs);
     let per_view = parents.len() / inputs.len().max(1);
@@ -153,7 +154,7 @@ fn refine_shown(
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(f32) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(Option<&PhaseRun<'_>>) -> ControlFlow<()>,
 ) -> Result<()> {
     let keep = shown(parents, views, raster, PARENTS_SHARE, renderer);
     let mut kept = keep.as_ref().map(|keep| families(parents, keep));
@@ -161,10 +162,10 @@ fn refine_shown(
         groups = Groups::equal(kept, views.len(), options.grouped);
     }
     let moved = kept.as_mut().unwrap_or(parents);
-    let mut step = |_: usize| progress(0.0);
+    let mut step = |_: usize| progress(None);
     let sizes = FitOptions::default();
     fit_masked(moved, views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;
-    let mut step = |phase: &PhaseRun<'_>| progress(phase.progress());
+    let mut step = |phase: &PhaseRun<'_>| progress(Some(phase));
     refine_groups(moved, &mut groups, views, raster, options, renderer, &mut step)
         .map_err(finishing::error)?;
     if let (Some(keep), Some(kept)) = (keep, kept) {

@@ -16,6 +16,7 @@ use crate::scene::mask::Mask;
 use crate::scene::pictures::Depth;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
+use std::cell::Cell;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::RasterOptions;
@@ -90,7 +91,8 @@ impl Prepared<'_> {
     }
 
     /// [`Prepared::reconstruct_with`] for a caller that shows the scene while it becomes sharper: `show` receives it
-    /// after each step of the refinement.
+    /// after each step, first of the primaries at the input's size, then of the whole scene, and may end the steps
+    /// ([`SceneSoFar::end`]).
     ///
     /// # Errors
     /// Those of [`Prepared::reconstruct_with`].
@@ -129,6 +131,7 @@ impl Prepared<'_> {
         let density = options.density;
         let scene_options = options.parents_options(inputs.len());
         let parents_options = options_of_parents(&scene_options, &inputs);
+        let ended = Cell::new(false);
         let mut factors = Vec::new();
         let mut parents = None;
         if options.matches_depth() || parents_options.is_some() {
@@ -142,7 +145,13 @@ impl Prepared<'_> {
                 tracker.begin(Stage::Parents, progress)?;
                 let mut part = tracker.parts(progress);
                 let (raster, renderer) = (&raster_at(1.0), &mut renderer);
-                refine_parents(&mut own, &inputs, raster, options, renderer, &mut part)?;
+                let mut step = |phase: Option<&PhaseRun<'_>>| {
+                    let Some(phase) = phase else { return part(0.0) };
+                    let stage = Stage::Parents;
+                    show(&SceneSoFar { stage, phase, unit, raster, ended: &ended });
+                    part(phase.progress())
+                };
+                refine_parents(&mut own, &inputs, raster, options, renderer, &mut step)?;
             }
             encoding = encoding.with_parents(network, &own)?;
             parents = Some(own);
@@ -188,11 +197,12 @@ impl Prepared<'_> {
             let done = fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
             fit = Some(done);
         }
-        if refine_options.steps > 0 {
+        if refine_options.steps > 0 && !ended.get() {
             tracker.begin(Stage::Refine, progress)?;
             let mut part = tracker.parts(progress);
             let mut step = |phase: &PhaseRun<'_>| {
-                show(&SceneSoFar { phase, unit, raster: &raster_options });
+                let (stage, raster) = (Stage::Refine, &raster_options);
+                show(&SceneSoFar { stage, phase, unit, raster, ended: &ended });
                 part(phase.progress())
             };
             let (raster, how) = (&raster_options, &refine_options);
@@ -246,10 +256,12 @@ impl Prepared<'_> {
 
 /// A scene that a refinement has not ended yet.
 pub struct SceneSoFar<'a> {
+    stage: Stage,
     phase: &'a PhaseRun<'a>,
     /// Length of the optimisation's unit, world units.
     unit: f32,
     raster: &'a RasterOptions,
+    ended: &'a Cell<bool>,
 }
 
 impl SceneSoFar<'_> {
@@ -262,7 +274,23 @@ impl SceneSoFar<'_> {
         splats
     }
 
-    /// The rules to render them at target resolution.
+    /// [`Stage::Parents`] while the primaries are refined, which have the input's size; then [`Stage::Refine`].
+    pub fn stage(&self) -> Stage {
+        self.stage
+    }
+
+    /// Number of steps of this stage so far.
+    pub fn steps(&self) -> usize {
+        self.phase.steps()
+    }
+
+    /// Ends the refinement after some more steps ([`PhaseRun::end`]). The scene is made from what they give.
+    pub fn end(&self) {
+        self.phase.end();
+        self.ended.set(true);
+    }
+
+    /// The rules to render them at the size of the stage.
     pub fn raster_options(&self) -> RasterOptions {
         RasterOptions { near: self.raster.near * self.unit, ..*self.raster }
     }

@@ -128,6 +128,34 @@ fn a_cancelled_refinement_changes_nothing() {
 }
 
 #[test]
+fn an_ended_refinement_keeps_its_steps() {
+    let truth = pictures(&plane(0.6, 0.9));
+    let (start, cameras) = (displaced(0.4), cameras());
+    let view = |(camera, image)| TargetView { camera, image };
+    let views: Vec<_> = cameras.iter().zip(&truth).map(view).collect();
+    let (raster, options) = (RasterOptions::default(), RefineOptions::default().with_steps(60));
+    let mut renderer = Renderer::default();
+    let mut changes = Vec::new();
+    let mut last = start.clone();
+    let mut splats = start.clone();
+    let mut end = |phase: &PhaseRun<'_>| {
+        if phase.steps() >= 30 {
+            phase.end();
+        }
+        let now = phase.splats();
+        let change = now.rows().iter().zip(last.rows()).map(|(a, b)| (a - b).abs()).sum::<f32>();
+        changes.push(change);
+        last = now;
+        ControlFlow::Continue(())
+    };
+    let report = refine(&mut splats, &views, &raster, &options, &mut renderer, &mut end).unwrap();
+    // Eight more steps, whose rates fall.
+    assert!(report.steps == 38 && report.after < report.before, "{report:?}");
+    assert!(changes[37] < 0.2 * changes[29], "{changes:?}");
+    assert!(splats == last);
+}
+
+#[test]
 fn a_picture_of_another_size_is_refused() {
     let (splats, cameras) = (plane(1.1, 0.3), cameras());
     let image = Rgb { width: 2, height: 1, data: vec![0; 6] };

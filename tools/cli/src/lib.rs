@@ -6,6 +6,7 @@
 pub mod commands;
 pub mod convert;
 pub mod failure;
+pub mod interrupt;
 pub mod lettering;
 pub mod pages;
 pub mod report;

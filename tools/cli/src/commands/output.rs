@@ -23,6 +23,7 @@ use subsplat::files::{SaveOptions, save_splats};
 use subsplat::network::config::Config;
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
 use subsplat::reconstruct::{Photo, Reconstruction};
+use subsplat::scene::mask::Mask;
 use subsplat::scene::metrics::{psnr, ssim};
 use subsplat::scene::pictures::{Depth, Rgb};
 use subsplat::scene::render::Renderer;
@@ -260,13 +261,8 @@ impl Views<'_> {
         if let Some((frame, (truth, mask), enlarged)) = truth {
             let truth = truth.to_unit();
             scored.frame = Some(frame);
-            // PSNR of the pixels that a mask keeps; masked ones count as equal in the windows of SSIM.
-            scored.psnr = Some(match &mask {
-                None => psnr(&picture.rgb, &truth, width, height)?,
-                Some(mask) => {
-                    psnr(&mask.kept_of(&picture.rgb), &mask.kept_of(&truth), mask.count(), 1)?
-                }
-            });
+            // Masked pixels count as equal in the windows of SSIM.
+            scored.psnr = Some(masked_psnr(&picture.rgb, &truth, (width, height), mask.as_ref())?);
             let merged = mask.map(|mask| mask.merged(&picture.rgb, &truth));
             let seen = merged.as_deref().unwrap_or(&picture.rgb);
             scored.ssim = ssim(seen, &truth, width, height).ok();
@@ -274,6 +270,19 @@ impl Views<'_> {
         }
         Ok(scored)
     }
+}
+
+/// PSNR of a picture of `width` × `height` pixels, dB: of those that the mask keeps.
+pub fn masked_psnr(
+    rgb: &[f32],
+    truth: &[f32],
+    (width, height): (usize, usize),
+    mask: Option<&Mask>,
+) -> Result<f64> {
+    Ok(match mask {
+        None => psnr(rgb, truth, width, height)?,
+        Some(mask) => psnr(&mask.kept_of(rgb), &mask.kept_of(truth), mask.count(), 1)?,
+    })
 }
 
 /// Writes `cameras.json` of the rendered views, in the scene's unit, with near and far.

@@ -2,11 +2,13 @@
 
 use super::args::{CropShapeArg, DetailArg, MatchingArg, SourceArgs, SurroundingsArg};
 use super::memory::{self, Planned};
+use crate::interrupt::Interrupt;
 use crate::pages;
 use crate::report::{Progress, print_line, print_warning, show_fraction};
 use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::borrow::Borrow;
+use std::sync::atomic::Ordering;
 use subsplat::cameras::check::{PairReport, Verdict};
 use subsplat::files::poses::scene::Scene;
 use subsplat::finish::RefineReport;
@@ -16,7 +18,7 @@ use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, InputSize, Matching, Options, Photo, Poses, Prepared,
-    Quality, Reconstruction, Reconstructor, Surroundings, TargetSize, Warning,
+    Quality, Reconstruction, Reconstructor, SceneSoFar, Surroundings, TargetSize, Warning,
 };
 use subsplat_kernels::camera::Size;
 
@@ -164,12 +166,18 @@ fn size_within(
 }
 
 /// Reconstructs `photos` under a progress bar, and prints warnings and depth ranges. Photographs
-/// that are passed by value are freed before the network runs.
+/// that are passed by value are freed before the network runs. Ctrl-C during a refinement ends it and keeps the scene
+/// so far. `watch` receives the scene after each step of a refinement, unless its cameras were adjusted: those of other
+/// photographs do not belong to them.
+///
+/// # Errors
+/// Those of the library and of `watch`.
 pub fn reconstruct(
     model: &Reconstructor,
     photos: impl Borrow<[Photo]>,
     options: &Options,
     progress: &mut Progress,
+    watch: &mut dyn FnMut(&SceneSoFar<'_>) -> Result<()>,
 ) -> Result<Reconstruction> {
     let result = progress.fraction("reconstruction", |bar| -> Result<_> {
         let mut show = |progress| show_fraction(bar, progress);
@@ -178,13 +186,35 @@ pub fn reconstruct(
         pages::trim();
         bar.suspend(|| print_prepared(&prepared, options.poses));
         let printed = prepared.warnings().len();
-        let result = prepared.reconstruct_with(&mut show)?;
+        let adjusted = prepared.pose_adjustment().is_some();
+        let (mut interrupt, mut failure) = (None, None);
+        let result = prepared.reconstruct_showing(&mut show, &mut |scene| {
+            let interrupt = interrupt.get_or_insert_with(Interrupt::watch);
+            if !adjusted && let Err(e) = watch(scene) {
+                failure = Some(e);
+            }
+            if failure.is_some() || is_noted(interrupt.as_ref()) {
+                scene.end();
+            }
+        })?;
+        if let Some(e) = failure {
+            return Err(e);
+        }
         pages::trim();
-        bar.suspend(|| print_reconstruction(&result, printed));
+        bar.suspend(|| {
+            print_reconstruction(&result, printed);
+            if is_noted(interrupt.flatten().as_ref()) {
+                print_line("Ctrl-C ended the refinement; the scene is what its steps gave so far");
+            }
+        });
         Ok(result)
     })?;
     progress.split_last(result.stage_times());
     Ok(result)
+}
+
+fn is_noted(interrupt: Option<&Interrupt>) -> bool {
+    interrupt.is_some_and(|interrupt| interrupt.noted().load(Ordering::Relaxed))
 }
 
 fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {

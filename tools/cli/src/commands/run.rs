@@ -2,6 +2,7 @@
 
 use super::args::{LowpassArg, PathArg, RenderingArgs, RunArgs, SceneFormatArg, SourceArgs};
 use super::clip::OfVideo;
+use super::curve::{self, Curve};
 use super::frames::{self, DepthSpread};
 use super::html::Page;
 use super::info::print_left_out;
@@ -23,14 +24,14 @@ use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
 use subsplat::reconstruct::stages::located;
 use subsplat::reconstruct::{Assessment, Backend};
-use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{
     comment_of_camera, comment_of_options, comment_of_origin, comment_of_photograph,
 };
 use subsplat::scene::score::GaussianReport;
 use subsplat::scene::splats::{SplatStatistics, Splats};
 use subsplat::{
-    Detail, InputSize, Options, Photo, Reconstruction, Reconstructor, TargetSize, Warning,
+    Detail, InputSize, Options, Photo, Reconstruction, Reconstructor, Refine, SceneSoFar,
+    TargetSize, Warning,
 };
 use subsplat_kernels::camera::{Camera, NearFar, Size};
 use subsplat_kernels::layout::{Convention, RasterOptions};
@@ -88,7 +89,13 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     output::check_formats(args, count, degree)?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, args.source.pair.force, &mut progress)?;
-    let result = reconstruct(&model, photos, &plan.options, &mut progress)?;
+    let crop = CropOptions {
+        target_size: Size::new(width, height),
+        ..model.crop_options(Size::new(w, h))
+    };
+    let mut curve = curve_of(args, &plan.scene, &targets, &crop)?;
+    let mut watch = |scene: &SceneSoFar<'_>| curve.follow(scene);
+    let result = reconstruct(&model, photos, &plan.options, &mut progress, &mut watch)?;
     follow_adjustment(&mut plan, &targets, &result, args.source.pair.force, &mut progress)?;
     check_opacity(result.splats(), args.content.min_opacity)?;
     let options = raster_options(&args.rendering, model.config(), &result);
@@ -96,7 +103,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut job = Views {
         out: &args.out,
         scene: &plan.scene,
-        crop: crop_of(&model, &result),
+        crop,
         options,
         motion: &args.motion,
         video: None,
@@ -136,18 +143,20 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let video = video::finish(job.video.take(), &args.motion, answer)?;
     let assessment = progress.stage("inputs", |_| result.assess(&mut renderer, &options))?;
     let clip = clip.map(|of_video| of_video.video.clone());
-    Done { model, result, options, scored, assessment, files, video, clip }
+    let curve = curve.points().to_vec();
+    Done { model, result, options, scored, curve, assessment, files, video, clip }
         .finish(args, &plan, progress, answer)?;
     print_left_out(&plan.scene);
     Ok(())
 }
 
-/// Crop of the targets' photographs: that of the inputs, which all have one size.
-fn crop_of(model: &Reconstructor, result: &Reconstruction) -> CropOptions {
-    let size = |p: &Rgb| Size::new(p.width, p.height);
-    let sizes = result.inputs().first().map(|c| (size(&c.input), size(&c.target)));
-    let (input, target_size) = sizes.unwrap_or_default();
-    CropOptions { target_size, ..model.crop_options(input) }
+/// The curve of a refinement of which the arguments name the steps or the time, on some of the frames `targets`.
+fn curve_of(args: &RunArgs, scene: &Scene, targets: &[usize], crop: &CropOptions) -> Result<Curve> {
+    let named = matches!(args.source.refine, Some(Refine::Steps(_) | Refine::Seconds(_)));
+    let count = if named { targets.len().min(curve::PHOTOGRAPHS) } else { 0 };
+    let frame = |i: usize| &scene.frames[targets[i * targets.len() / count]];
+    let view = |i: usize| Ok(Photo::from_frame(frame(i))?.crop(crop)?);
+    Ok(Curve::new((0..count).map(view).collect::<Result<_>>()?))
 }
 
 /// Describes the Gaussians of a scene that covers its inputs' pictures by `coverage`.
@@ -436,6 +445,7 @@ struct Done {
     result: Reconstruction,
     options: RasterOptions,
     scored: Vec<Scored>,
+    curve: Vec<curve::Point>,
     assessment: Assessment,
     files: Vec<Value>,
     video: Value,
@@ -493,6 +503,7 @@ impl Done {
                     "error_before": r.before,
                     "error_after": r.after,
                     "removed": r.removed,
+                    "curve": self.curve,
                 })
             ),
             "gaussians": result.splats().len(),

@@ -2,6 +2,7 @@
 //! another run in it. What stands under a final name is whole, and the program says one line where it can.
 
 use crate::program::{Called, call_in, called, files, workplace};
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -9,6 +10,7 @@ use subsplat::Splats;
 use subsplat::files::photos::image::{load, load_depth_png};
 use subsplat::files::poses::colmap;
 use subsplat::files::weights::tensors::TensorFile;
+use subsplat::reconstruct::Stage;
 
 /// A small run of each kind of file.
 const RUN: &str = "run scene --context 0,2 --target 1 --input-size 64 --quality fast --save ply,spz,html,glb -o out";
@@ -123,6 +125,36 @@ fn a_killed_run_leaves_whole_files() {
     let place = workplace();
     let arguments = RUN.replace("-o out", "-o OUT");
     kill(env!("CARGO_BIN_EXE_subsplat"), place.path(), &arguments, kills(6));
+}
+
+/// Ctrl-C during a refinement of ten minutes: the scene so far and its pictures are written. A curve has the scores of
+/// the photograph that the scene is not made from.
+#[cfg(unix)]
+#[test]
+fn ctrl_c_keeps_the_scene_of_the_steps_so_far() {
+    let place = workplace();
+    let arguments =
+        "--json run scene --context 0,2 --target 1 --input-size 64 --refine 10m --save ply -o out";
+    let mut command = command(env!("CARGO_BIN_EXE_subsplat"), place.path(), arguments, "");
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
+    let stage = format!("reconstruction: {}", Stage::Refine.description());
+    assert!(lines.by_ref().any(|line| line.starts_with(&stage)));
+    let id = child.id().to_string();
+    assert!(Command::new("kill").args(["-INT", &id]).status().unwrap().success());
+    let rest: Vec<String> = lines.collect();
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(0), "{rest:?}");
+    assert!(rest.iter().any(|line| line.starts_with("Ctrl-C ended the refinement")), "{rest:?}");
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let curve = report["refine"]["curve"].as_array().unwrap();
+    let psnr = |point: &serde_json::Value| point["psnr"].as_f64().unwrap();
+    let of = |point: &serde_json::Value| (point["steps"].as_u64(), point["seconds"].as_f64());
+    assert!(curve.len() > 2 && curve.windows(2).all(|w| of(&w[0]) < of(&w[1])), "{curve:?}");
+    let end = report["psnr"].as_f64().unwrap();
+    assert!(curve.iter().all(|p| (psnr(p) - end).abs() < 1.0), "{end} after {curve:?}");
+    assert!(report["refine"]["steps"].as_u64() >= of(curve.last().unwrap()).0, "{report}");
+    assert!(whole_files(&place.path().join("out")) > 5);
 }
 
 /// The photographs of the example, without their cameras.

@@ -8,16 +8,14 @@ use crate::train::ranks::agree;
 use crate::train::run::{Event, Limits, StepReport, Training};
 use crate::train::step::Seconds;
 use crate::train::validate::{Found, Validator};
-use anyhow::{Context, Result};
+use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
-use signal_hook::consts::SIGINT;
-use signal_hook::flag;
 use std::io::IsTerminal;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use subsplat_cli::commands::environment;
+use subsplat_cli::interrupt::Interrupt;
 use subsplat_cli::report::{Answer, mebibytes, print_line, print_warning};
 
 /// Time between two lines where stderr is no terminal.
@@ -26,8 +24,6 @@ const LINE_EVERY: Duration = Duration::from_secs(20);
 const PROFILE_EVERY: usize = 15;
 /// Weight of the newest step in the printed means.
 const NEW_WEIGHT: f64 = 0.05;
-/// Exit code of a program that SIGINT ended, as shells report it.
-const INTERRUPTED: i32 = 130;
 
 /// Runs the command.
 pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
@@ -39,8 +35,9 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let first = peers.ranks().rank == 0;
     // A file that one rank cannot read or write ends all of them.
     let config = agree(&mut *peers, TrainConfig::load(&args.config))?;
-    let stop = stop_on_interrupt()?;
-    let limits = Limits { minutes: args.minutes, steps: args.steps, stop: Some(&stop) };
+    let interrupt = Interrupt::watch();
+    let stop = interrupt.as_ref().map(Interrupt::noted);
+    let limits = Limits { minutes: args.minutes, steps: args.steps, stop };
     let mut training = Training::open_shared(&config, &args.out, peers)?;
     let mut watch = Watch::new(&config, limits);
     let board = first.then(|| Board::create(&args.out)).transpose();
@@ -77,7 +74,7 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
     let saved = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
     let (done, steps) = (progress.step, config.steps);
-    let stopped = stop.load(Ordering::Relaxed);
+    let stopped = stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
     let how = if stopped { "stopped by Ctrl-C, " } else { "" };
     print_line(format!("{how}{done} of {steps} steps done{}", saved.unwrap_or_default()));
     answer.finish(&json!({
@@ -89,16 +86,6 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
         "weights": weights,
         "stopped": stopped,
     }))
-}
-
-/// A flag that Ctrl-C sets. A second Ctrl-C ends the program.
-fn stop_on_interrupt() -> Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    // The actions run in this order: the first Ctrl-C does not find the flag set.
-    flag::register_conditional_shutdown(SIGINT, INTERRUPTED, Arc::clone(&stop))
-        .and_then(|_| flag::register(SIGINT, Arc::clone(&stop)))
-        .context("Ctrl-C")?;
-    Ok(stop)
 }
 
 /// Progress for the user: a bar on a terminal, else a line from time to time.

@@ -355,10 +355,11 @@ impl<'a> PictureMaker<'a> {
         let small = self.raster_options(network, 1.0, None);
         let mut parents = network.encoding().parents(network.model.model())?;
         let mut part = |_: f32| ControlFlow::Continue(());
+        let mut go_on = |_: Option<&PhaseRun<'_>>| ControlFlow::Continue(());
         match_parents(&mut parents, inputs, self.bounds.near_far(), &mut part)?;
         let options = self.refine.options_for(inputs.len(), true);
         let renderer = &mut Renderer::default();
-        refine_parents(&mut parents, inputs, &small, &options, renderer, &mut part)?;
+        refine_parents(&mut parents, inputs, &small, &options, renderer, &mut go_on)?;
         Ok(parents)
     }
 
@@ -375,6 +376,7 @@ impl<'a> PictureMaker<'a> {
         let mut encoding = network.encoding();
         let mut own = encoding.parents(model)?;
         let mut part = |_: f32| ControlFlow::Continue(());
+        let mut go_on = |_: Option<&PhaseRun<'_>>| ControlFlow::Continue(());
         if parents == Parents::Matched {
             let near_far = self.bounds.near_far();
             match_parents(&mut own, inputs, near_far, &mut part)?;
@@ -383,7 +385,7 @@ impl<'a> PictureMaker<'a> {
         let options =
             options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
         if let Some(options) = options {
-            refine_parents(&mut own, inputs, &small, &options, &mut renderer, &mut part)?;
+            refine_parents(&mut own, inputs, &small, &options, &mut renderer, &mut go_on)?;
         }
         encoding = encoding.with_parents(model, &own)?;
         let mut children = network.children(model, &encoding, inputs, self.density, &small)?;

@@ -118,7 +118,8 @@ pub struct SourceArgs {
     /// These steps follow those of --fit. Each step draws one photograph from the splats, and changes the
     /// splats towards it. `off`; a number of steps; or a time, such as `20s` or `2m`. `auto`: 16 steps for two
     /// photographs, 40 for three, 75 for four, 24 for each of more, 240 at most. The steps end early where the
-    /// photographs no longer improve.
+    /// photographs no longer improve. Ctrl-C ends them and keeps the scene so far. With a number or a time,
+    /// `run` writes the scores of photographs that the scene is not made from, over the seconds (metrics.json).
     #[arg(
         long,
         value_name = "auto | off | STEPS | SECONDSs",

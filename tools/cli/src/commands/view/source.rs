@@ -138,7 +138,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
         Some(_) => Refine::Off,
     };
     let photos = run::photographs(&scene, &context, args.source.pair.force, progress)?;
-    let result = reconstruct(&model, photos.as_slice(), &options, progress)?;
+    let result = reconstruct(&model, photos.as_slice(), &options, progress, &mut |_| Ok(()))?;
     // Later calls use the depth range of this check.
     let prior = result.initial_depth_range().clone();
     let options = options.with_depth_prior(prior).with_check(Check::Off);
