@@ -55,14 +55,16 @@ impl Dropout {
         });
     }
 
-    /// Turns gradients by the Gaussians that were drawn into those by `rows`, both `[N, 11]`.
-    pub fn chain(&self, rows: &[f32], gradients: &mut [f32]) {
+    /// Turns gradients by the Gaussians `drawn` into those by `rows`, all `[N, 11]`. Those left out have opacity 0.
+    pub fn chain(&self, rows: &[f32], drawn: &[f32], gradients: &mut [f32]) {
         let rows = rows.par_chunks_exact(SPLAT_STRIDE);
+        let rows = rows.zip(drawn.par_chunks_exact(SPLAT_STRIDE));
         let pairs = gradients.par_chunks_exact_mut(SPLAT_STRIDE).zip(rows);
-        pairs.enumerate().with_min_len(TASK).for_each(|(i, (gradient, row))| {
-            let free = 1.0 - row[OPACITY_OFFSET];
-            let slope = self.denser * free.powf(self.denser - 1.0);
-            gradient[OPACITY_OFFSET] *= if self.leaves_out(i) { 0.0 } else { slope };
+        pairs.with_min_len(TASK).for_each(|(gradient, (row, drawn))| {
+            let [free, drawn_free] = [row, drawn].map(|row| 1.0 - row[OPACITY_OFFSET]);
+            // The drawn Gaussian has 1 − α' = (1 − α)ᵈ, d = `denser`.
+            let slope = self.denser * drawn_free / free;
+            gradient[OPACITY_OFFSET] *= if drawn_free == 1.0 { 0.0 } else { slope };
         });
     }
 }
@@ -128,7 +130,9 @@ mod tests {
         let dropout = Dropout::new(0.1, 3);
         let weight = |i: usize| 1.0 + (i % 7) as f32;
         let mut gradients: Vec<f32> = (0..rows.len()).map(|at| weight(at / SPLAT_STRIDE)).collect();
-        dropout.chain(&rows, &mut gradients);
+        let mut drawn = Vec::new();
+        dropout.draw(&rows, &mut drawn);
+        dropout.chain(&rows, &drawn, &mut gradients);
         let drawn = |difference: f32| {
             let mut moved = rows.clone();
             for row in moved.chunks_exact_mut(SPLAT_STRIDE) {

@@ -3,7 +3,7 @@
 
 use crate::scene::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
 use rayon::prelude::*;
-use subsplat_kernels::cpu::dssim::{Window, plane};
+use subsplat_kernels::cpu::dssim::{Scratch, Window, band};
 
 /// A loss and its gradient with respect to one of its arguments.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,6 +52,8 @@ pub fn mse(x: &[f32], target: &[f32]) -> Scored {
 /// Number of elements summed together. The fixed size makes the sums independent of the number of
 /// threads.
 const CHUNK: usize = 4096;
+/// Rows of a parallel task of [`dssim`].
+const BAND: usize = 64;
 
 /// Returns the structural dissimilarity (1 − SSIM)/2 of planes `[C, height, width]` in [0, 1], with
 /// its gradient by `x`.
@@ -72,10 +74,15 @@ pub fn dssim(x: &[f32], target: &[f32], width: usize, height: usize) -> Scored {
     };
     let factor = (-0.5 / windows as f64) as f32;
     let mut gradient = vec![0.0; x.len()];
-    let sums: Vec<f64> = gradient
-        .par_chunks_mut(pixels)
-        .zip(x.par_chunks(pixels).zip(target.par_chunks(pixels)))
-        .map(|(g, (x, t))| plane(&shape, [x, t], width, factor, g))
-        .collect();
+    let planes =
+        gradient.par_chunks_mut(pixels).zip(x.par_chunks(pixels)).zip(target.par_chunks(pixels));
+    let bands = planes.flat_map(|((g, x), t)| {
+        let bands = g.par_chunks_mut(BAND * width).enumerate();
+        bands.map_init(Scratch::default, move |scratch, (i, g)| {
+            let rows = i * BAND..i * BAND + g.len() / width;
+            band(&shape, [x, t], width, rows, factor, g, scratch)
+        })
+    });
+    let sums: Vec<f64> = bands.collect();
     Scored { value: 0.5 * (1.0 - sums.iter().sum::<f64>() / windows as f64), gradient }
 }

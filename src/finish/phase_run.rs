@@ -191,7 +191,7 @@ impl<'a> PhaseRun<'a> {
             by_planes(target.loss(planes), planes)
         });
         if let Some(dropout) = &dropout {
-            dropout.chain(self.optimiser.rows(), &mut self.gradients.rows);
+            dropout.chain(self.optimiser.rows(), &self.drawn, &mut self.gradients.rows);
         }
         if !(self.phase.loss.across > 0.0) || self.targets.len() != 2 {
             return 0..0;

@@ -3,10 +3,11 @@
 //!
 //! Windowed means are two passes of N taps, each with a block of results in registers.
 //! The transpose of a windowed mean is a windowed mean with reversed taps of the map with
-//! N − 1 zeros around it.
+//! N − 1 zeros around it. A plane is computed in bands of rows, which threads share.
 
 use super::simd::vectorize;
 use super::sums::sum_of;
+use std::ops::Range;
 
 /// Taps of the window's one axis, and the constants of SSIM.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,52 +46,41 @@ fn pass<const N: usize>(taps: &[f32; N], from: &[f32], step: usize, out: &mut [f
     }
 }
 
-/// A map with N − 1 rows and columns of zeros on every side.
-struct Padded {
-    data: Vec<f32>,
-    width: usize,
-    height: usize,
+/// Buffers of [`band`], for one band after the other.
+#[derive(Debug, Default)]
+pub struct Scratch {
+    /// Means along rows of x, t, x², t² and x·t, side by side.
+    across: Vec<f32>,
+    /// x², t² and x·t of a row.
+    squares: Vec<f32>,
+    /// The same means over windows of a row, then the scores.
+    means: Vec<f32>,
+    /// Derivatives by the windows' means of x, x² and x·t, with N − 1 zeros on both sides, and rows of zeros where there
+    /// are no windows.
+    maps: [Vec<f32>; 3],
+    /// A map after the pass along its rows.
+    rows: Vec<f32>,
+    /// The transposes of the windowed means.
+    spread: [Vec<f32>; 3],
 }
 
-impl Padded {
-    fn new<const N: usize>(width: usize, height: usize) -> Self {
-        let (width, height) = (width + 2 * (N - 1), height + 2 * (N - 1));
-        Self { data: vec![0.0; width * height], width, height }
-    }
-
-    #[inline(always)]
-    fn row<const N: usize>(&mut self, y: usize, width: usize) -> &mut [f32] {
-        &mut self.data[(y + N - 1) * self.width + N - 1..][..width]
-    }
-
-    /// The transpose of the windowed mean: N − 1 rows and columns more than the map.
-    #[inline(always)]
-    fn spread<const N: usize>(&self, taps: &[f32; N]) -> Vec<f32> {
-        let mut turned = *taps;
-        turned.reverse();
-        let (width, height) = (self.width + 1 - N, self.height + 1 - N);
-        let mut rows = vec![0.0; width * self.height];
-        for (row, out) in self.data.chunks_exact(self.width).zip(rows.chunks_exact_mut(width)) {
-            pass(&turned, row, 1, out);
-        }
-        let mut out = vec![0.0; width * height];
-        pass(&turned, &rows, width, &mut out);
-        out
-    }
-}
-
-/// Sum of SSIM over one plane's windows; `g` becomes `factor` times its derivative by
-/// `x`. Planes `x`, `t` and `g` are `width` wide and at least N in both directions.
-pub fn plane<const N: usize>(
+/// Sum of SSIM over the windows of one plane whose first row is in `rows`; `g`, the pixels of these rows, becomes
+/// `factor` times the derivative of the whole plane's sum by `x`. Planes `x` and `t` are `width` wide and at least N in
+/// both directions.
+///
+/// Bands of a plane have the same `g` as the whole plane. Each repeats N − 1 rows of windows of the one before.
+pub fn band<const N: usize>(
     window: &Window<N>,
     [x, t]: [&[f32]; 2],
     width: usize,
+    rows: Range<usize>,
     factor: f32,
     g: &mut [f32],
+    scratch: &mut Scratch,
 ) -> f64 {
     vectorize(
         #[inline(always)]
-        || run(window, [x, t], width, factor, g),
+        || run(window, [x, t], width, rows, factor, g, scratch),
     )
 }
 
@@ -99,18 +89,21 @@ fn run<const N: usize>(
     window: &Window<N>,
     [x, t]: [&[f32]; 2],
     width: usize,
+    rows: Range<usize>,
     factor: f32,
     g: &mut [f32],
+    scratch: &mut Scratch,
 ) -> f64 {
     let inner = width + 1 - N;
-    let height = x.len() / width;
-    let rows = height + 1 - N;
-    // Means along rows of x, t, x², t² and x·t, side by side.
-    let mut across = vec![0f32; 5 * inner * height];
-    let mut square = [vec![0f32; width], vec![0f32; width], vec![0f32; width]];
+    let windows = rows.start.saturating_sub(N - 1)..rows.end.min(x.len() / width + 1 - N);
+    let Scratch { across, squares, means, maps, rows: passed, spread } = scratch;
+    across.resize(5 * inner * (windows.len() + N - 1), 0.0);
+    squares.resize(3 * width, 0.0);
     for (y, out) in across.chunks_exact_mut(5 * inner).enumerate() {
+        let y = windows.start + y;
         let (x, t) = (&x[y * width..][..width], &t[y * width..][..width]);
-        let [xx, tt, xt] = &mut square;
+        let (xx, rest) = squares.split_at_mut(width);
+        let (tt, xt) = rest.split_at_mut(width);
         for i in 0..width {
             (xx[i], tt[i], xt[i]) = (x[i] * x[i], t[i] * t[i], x[i] * t[i]);
         }
@@ -118,19 +111,38 @@ fn run<const N: usize>(
             pass(&window.taps, from, 1, out);
         }
     }
-    let [mut by_x, mut by_xx, mut by_xt] = [(); 3].map(|()| Padded::new::<N>(inner, rows));
-    let mut means = vec![0f32; 5 * inner];
-    let mut scores = vec![0f32; inner];
-    let mut sum = 0.0;
-    for y in 0..rows {
-        pass(&window.taps, &across[y * 5 * inner..], 5 * inner, &mut means);
-        let out = [by_x.row::<N>(y, inner), by_xx.row::<N>(y, inner), by_xt.row::<N>(y, inner)];
-        row(window, &means, &mut scores, out);
-        sum += sum_of(&scores, |v| v);
+    // Row 0 of a map is the window that begins N − 1 rows above the band.
+    let (padded, count) = (inner + 2 * (N - 1), rows.len() + N - 1);
+    for map in &mut *maps {
+        map.clear();
+        map.resize(padded * count, 0.0);
     }
-    let [by_x, by_xx, by_xt] =
-        [by_x.spread(&window.taps), by_xx.spread(&window.taps), by_xt.spread(&window.taps)];
-    for (i, g) in g.iter_mut().enumerate() {
+    means.resize(6 * inner, 0.0);
+    let (means, scores) = means.split_at_mut(5 * inner);
+    let mut sum = 0.0;
+    for y in windows.clone() {
+        pass(&window.taps, &across[(y - windows.start) * 5 * inner..], 5 * inner, means);
+        let at = (y + N - 1 - rows.start) * padded + N - 1;
+        row(window, means, scores, maps.each_mut().map(|map| &mut map[at..at + inner]));
+        if rows.contains(&y) {
+            sum += sum_of(scores, |v| v);
+        }
+    }
+    // The transpose of a windowed mean.
+    let mut turned = window.taps;
+    turned.reverse();
+    passed.resize(width * count, 0.0);
+    for (map, out) in maps.iter().zip(&mut *spread) {
+        for (row, out) in map.chunks_exact(padded).zip(passed.chunks_exact_mut(width)) {
+            pass(&turned, row, 1, out);
+        }
+        out.resize(width * rows.len(), 0.0);
+        pass(&turned, passed, width, out);
+    }
+    let pixels = rows.start * width..rows.end * width;
+    let (x, t) = (&x[pixels.clone()], &t[pixels]);
+    let [by_x, by_xx, by_xt] = spread.each_ref().map(|map| &map[..x.len()]);
+    for (i, g) in g[..x.len()].iter_mut().enumerate() {
         *g = factor * (by_x[i] + 2.0 * x[i] * by_xx[i] + t[i] * by_xt[i]);
     }
     sum
@@ -165,5 +177,34 @@ fn row<const N: usize>(
         by_x[i] = s * (by_light + by_structure);
         by_xx[i] = -s * cov / variances;
         by_xt[i] = 2.0 * s * cov / covariance;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layout::random;
+
+    #[test]
+    fn bands_are_parts_of_the_plane() {
+        let (width, height) = (23, 50);
+        let value = |i: usize| (random::mix(i as u64 + 1) >> 40) as f32 / 2f32.powi(24);
+        let x: Vec<f32> = (0..width * height).map(value).collect();
+        let t: Vec<f32> =
+            x.iter().enumerate().map(|(i, x)| 0.6 * x + 0.4 * value(i + 9000)).collect();
+        let shape = Window { taps: [0.1, 0.2, 0.4, 0.2, 0.1], c: [1e-4, 9e-4], covariance: 1.04 };
+        let mut scratch = Scratch::default();
+        let mut whole = vec![0.0; x.len()];
+        let sum = band(&shape, [&x, &t], width, 0..height, -0.3, &mut whole, &mut scratch);
+        assert!(sum.abs() > 1.0 && whole.iter().all(|g| *g != 0.0));
+        for rows in [1, 3, 4, 17, 49] {
+            let (mut parts, mut sum_of_parts) = (vec![0.0; x.len()], 0.0);
+            for (i, g) in parts.chunks_mut(rows * width).enumerate() {
+                let band_rows = i * rows..i * rows + g.len() / width;
+                sum_of_parts += band(&shape, [&x, &t], width, band_rows, -0.3, g, &mut scratch);
+            }
+            assert_eq!(parts, whole, "{rows}");
+            assert!((sum_of_parts / sum - 1.0).abs() < 1e-12, "{rows}: {sum_of_parts} {sum}");
+        }
     }
 }
