@@ -162,6 +162,8 @@ fn refine_shown(
         groups = Groups::equal(kept, views.len(), options.grouped);
     }
     let moved = kept.as_mut().unwrap_or(parents);
+    // Without this fit, three photographs of `../shared/photos` have 18.93 dB / .683 instead of 18.92 / .685 (128 → 256),
+    // five 23.99 / .823 instead of 24.09 / .825.
     let mut step = |_: usize| progress(None);
     let sizes = FitOptions::default();
     fit_masked(moved, views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;
