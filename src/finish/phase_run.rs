@@ -140,8 +140,8 @@ impl<'a> PhaseRun<'a> {
     /// round of the photographs, in which the rates fall to their end: steps at high rates leave noise.
     pub fn end(&self) {
         if self.end.get().is_none() {
-            let rounds = self.targets.len().clamp(END_STEPS[0], END_STEPS[1]);
-            self.end.set(Some(End { begin: self.step, steps: rounds, at: self.progress() }));
+            let steps = self.targets.len().clamp(END_STEPS[0], END_STEPS[1]);
+            self.end.set(Some(End { begin: self.step, steps, at: self.progress() }));
         }
     }
 

@@ -175,8 +175,8 @@ pub struct RefineReport {
 
 /// Refines `splats` on `views` in place. `progress` receives the refinement after each step, whose
 /// [`PhaseRun::splats`] a caller can show; [`PhaseRun::end`] ends the steps and keeps what they gave;
-/// [`ControlFlow::Break`] cancels. The colour offsets are
-/// added to the δ of [`Splats::gain`], which has four numbers a Gaussian afterwards.
+/// [`ControlFlow::Break`] cancels. The colour offsets are added to the δ of
+/// [`Splats::gain`], which has four numbers a Gaussian afterwards.
 ///
 /// # Errors
 /// A picture of another size than its camera; [`RefineOptions::time`] where there is no clock; a

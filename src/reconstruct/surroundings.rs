@@ -27,7 +27,11 @@ use subsplat_kernels::layout::{RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, gain_w
 #[non_exhaustive]
 pub enum Surroundings {
     /// In the colours and depths of the pixels at the edges, about 1 % more Gaussians. None where the caller gives
-    /// their number ([`Options::density`](super::Options::density)), or where neither [`Options::fit`](super::Options::fit) nor [`Options::refine`](super::Options::refine) changes them.
+    /// their number ([`Options::density`]), or where neither [`Options::fit`] nor [`Options::refine`] changes them.
+    ///
+    /// [`Options::density`]: super::Options::density
+    /// [`Options::fit`]: super::Options::fit
+    /// [`Options::refine`]: super::Options::refine
     #[default]
     Photographs,
     /// None.

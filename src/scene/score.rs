@@ -54,8 +54,7 @@ impl Score {
             return Self::of(picture, truth);
         };
         let unit = truth.to_unit();
-        let (own, theirs) = (mask.kept_of(picture), mask.kept_of(&unit));
-        let psnr = psnr(&own, &theirs, own.len() / 3, 1)?;
+        let psnr = psnr_of_kept(picture, &unit, (truth.width, truth.height), Some(mask))?;
         Ok(Self { psnr, ..Self::of(&mask.merged(picture, &unit), truth)? })
     }
 
@@ -72,6 +71,22 @@ impl Score {
             sharpness: mean(all.iter().filter_map(|s| s.sharpness).collect()),
             gmsd: mean(all.iter().map(|s| s.gmsd).collect())?,
         })
+    }
+}
+
+/// PSNR of the pixels of a picture `[H, W, 3]`, display values, of `width` × `height` pixels, that `mask` keeps, dB.
+///
+/// # Errors
+/// Pictures of other sizes; values that are not finite; no pixel that counts.
+pub fn psnr_of_kept(
+    picture: &[f32],
+    truth: &[f32],
+    (width, height): (usize, usize),
+    mask: Option<&Mask>,
+) -> Result<f64, MetricsError> {
+    match mask {
+        None => psnr(picture, truth, width, height),
+        Some(mask) => psnr(&mask.kept_of(picture), &mask.kept_of(truth), mask.count(), 1),
     }
 }
 

@@ -8,9 +8,15 @@ use std::sync::{Arc, LazyLock};
 /// Exit code of a program that SIGINT ended, as shells report it.
 const INTERRUPTED: i32 = 130;
 
-/// What the handler of SIGINT reads and writes; `None` where the system lets a program have none.
-static FLAGS: LazyLock<Option<Flags>> = LazyLock::new(|| Flags::register().ok());
+static FLAGS: LazyLock<Flags> = LazyLock::new(|| {
+    let flags = Flags::default();
+    // Where the system refuses a handler, Ctrl-C ends the program as before, and no flag is set.
+    let _ = flags.register();
+    flags
+});
 
+/// Flags of the handler of SIGINT.
+#[derive(Default)]
 struct Flags {
     /// The next Ctrl-C ends the program.
     ends: Arc<AtomicBool>,
@@ -19,39 +25,39 @@ struct Flags {
 }
 
 impl Flags {
-    fn register() -> std::io::Result<Self> {
-        let [ends, noted] = [(); 2].map(|()| Arc::new(AtomicBool::new(false)));
+    fn register(&self) -> std::io::Result<()> {
         // The actions run in this order: the first Ctrl-C does not find `ends` set.
-        flag::register_conditional_shutdown(SIGINT, INTERRUPTED, Arc::clone(&ends))?;
-        flag::register(SIGINT, Arc::clone(&ends))?;
-        flag::register(SIGINT, Arc::clone(&noted))?;
-        Ok(Self { ends, noted })
+        flag::register_conditional_shutdown(SIGINT, INTERRUPTED, Arc::clone(&self.ends))?;
+        flag::register(SIGINT, Arc::clone(&self.ends))?;
+        flag::register(SIGINT, Arc::clone(&self.noted))?;
+        Ok(())
     }
 }
 
 /// Steps that Ctrl-C can end, one at a time. Once this is dropped, Ctrl-C ends the program.
-pub struct Interrupt {
-    flags: &'static Flags,
-}
+pub struct Interrupt(());
 
 impl Interrupt {
-    /// From now on, the first Ctrl-C is noted, and a second one ends the program. `None` where the system lets a
-    /// program have no handler.
-    pub fn watch() -> Option<Self> {
-        let flags = FLAGS.as_ref()?;
-        flags.noted.store(false, Ordering::Relaxed);
-        flags.ends.store(false, Ordering::Relaxed);
-        Some(Self { flags })
+    /// From now on, the first Ctrl-C is noted, and a second one ends the program.
+    pub fn watch() -> Self {
+        FLAGS.noted.store(false, Ordering::Relaxed);
+        FLAGS.ends.store(false, Ordering::Relaxed);
+        Self(())
     }
 
     /// The flag that a Ctrl-C sets.
-    pub fn noted(&self) -> &AtomicBool {
-        &self.flags.noted
+    pub fn flag(&self) -> &AtomicBool {
+        &FLAGS.noted
+    }
+
+    /// Returns whether there was a Ctrl-C.
+    pub fn is_noted(&self) -> bool {
+        self.flag().load(Ordering::Relaxed)
     }
 }
 
 impl Drop for Interrupt {
     fn drop(&mut self) {
-        self.flags.ends.store(true, Ordering::Relaxed);
+        FLAGS.ends.store(true, Ordering::Relaxed);
     }
 }

@@ -1,6 +1,5 @@
 //! The score of photographs that the scene is not made from, over the time of its refinement.
 
-use super::output::masked_psnr;
 use anyhow::Result;
 use serde::Serialize;
 use std::time::{Duration, Instant};
@@ -8,12 +7,13 @@ use subsplat::SceneSoFar;
 use subsplat::reconstruct::Stage;
 use subsplat::reconstruct::inputs::crop::Cropped;
 use subsplat::scene::render::Renderer;
+use subsplat::scene::score::psnr_of_kept;
 
 /// Most photographs of a score.
 pub const PHOTOGRAPHS: usize = 4;
 /// Least time between two scores, in times of the last score itself: a score takes a twentieth of the refinement.
 const BETWEEN: u32 = 20;
-/// Factor of the times of two scores, at least: 60 s have a dozen of them, 600 s eighteen.
+/// Factor of the times of two scores, at least: their number grows with the logarithm of the time.
 const GROWTH: f32 = 1.4;
 
 /// A score during the refinement.
@@ -45,9 +45,9 @@ impl Curve {
         Self { views, points: Vec::new(), begun: None, scoring, next }
     }
 
-    /// The scores so far.
-    pub fn points(&self) -> &[Point] {
-        &self.points
+    /// The scores.
+    pub fn into_points(self) -> Vec<Point> {
+        self.points
     }
 
     /// Scores a scene that is being refined, where it is time to.
@@ -80,7 +80,7 @@ impl Curve {
             let picture = renderer.render(&splats, &view.target_camera, &options);
             let size = (picture.width, picture.height);
             let (truth, mask) = (view.target.to_unit(), view.target_mask.as_ref());
-            sum += masked_psnr(&picture.rgb, &truth, size, mask)?;
+            sum += psnr_of_kept(&picture.rgb, &truth, size, mask)?;
         }
         Ok(sum / self.views.len() as f64)
     }

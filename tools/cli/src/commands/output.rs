@@ -23,10 +23,10 @@ use subsplat::files::{SaveOptions, save_splats};
 use subsplat::network::config::Config;
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
 use subsplat::reconstruct::{Photo, Reconstruction};
-use subsplat::scene::mask::Mask;
-use subsplat::scene::metrics::{psnr, ssim};
+use subsplat::scene::metrics::ssim;
 use subsplat::scene::pictures::{Depth, Rgb};
 use subsplat::scene::render::Renderer;
+use subsplat::scene::score::psnr_of_kept;
 use subsplat_kernels::camera::{Camera, NearFar};
 use subsplat_kernels::layout::RasterOptions;
 
@@ -262,7 +262,7 @@ impl Views<'_> {
             let truth = truth.to_unit();
             scored.frame = Some(frame);
             // Masked pixels count as equal in the windows of SSIM.
-            scored.psnr = Some(masked_psnr(&picture.rgb, &truth, (width, height), mask.as_ref())?);
+            scored.psnr = Some(psnr_of_kept(&picture.rgb, &truth, (width, height), mask.as_ref())?);
             let merged = mask.map(|mask| mask.merged(&picture.rgb, &truth));
             let seen = merged.as_deref().unwrap_or(&picture.rgb);
             scored.ssim = ssim(seen, &truth, width, height).ok();
@@ -270,19 +270,6 @@ impl Views<'_> {
         }
         Ok(scored)
     }
-}
-
-/// PSNR of a picture of `width` × `height` pixels, dB: of those that the mask keeps.
-pub fn masked_psnr(
-    rgb: &[f32],
-    truth: &[f32],
-    (width, height): (usize, usize),
-    mask: Option<&Mask>,
-) -> Result<f64> {
-    Ok(match mask {
-        None => psnr(rgb, truth, width, height)?,
-        Some(mask) => psnr(&mask.kept_of(rgb), &mask.kept_of(truth), mask.count(), 1)?,
-    })
 }
 
 /// Writes `cameras.json` of the rendered views, in the scene's unit, with near and far.

@@ -8,7 +8,7 @@ use crate::report::{Progress, print_line, print_warning, show_fraction};
 use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::borrow::Borrow;
-use std::sync::atomic::Ordering;
+use std::cell::LazyCell;
 use subsplat::cameras::check::{PairReport, Verdict};
 use subsplat::files::poses::scene::Scene;
 use subsplat::finish::RefineReport;
@@ -187,13 +187,15 @@ pub fn reconstruct(
         bar.suspend(|| print_prepared(&prepared, options.poses));
         let printed = prepared.warnings().len();
         let adjusted = prepared.pose_adjustment().is_some();
-        let (mut interrupt, mut failure) = (None, None);
+        // From the first step on.
+        let interrupt = LazyCell::new(Interrupt::watch);
+        let mut failure = None;
         let result = prepared.reconstruct_showing(&mut show, &mut |scene| {
-            let interrupt = interrupt.get_or_insert_with(Interrupt::watch);
+            let is_noted = interrupt.is_noted();
             if !adjusted && let Err(e) = watch(scene) {
                 failure = Some(e);
             }
-            if failure.is_some() || is_noted(interrupt.as_ref()) {
+            if failure.is_some() || is_noted {
                 scene.end();
             }
         })?;
@@ -203,7 +205,7 @@ pub fn reconstruct(
         pages::trim();
         bar.suspend(|| {
             print_reconstruction(&result, printed);
-            if is_noted(interrupt.flatten().as_ref()) {
+            if interrupt.is_noted() {
                 print_line("Ctrl-C ended the refinement; the scene is what its steps gave so far");
             }
         });
@@ -211,10 +213,6 @@ pub fn reconstruct(
     })?;
     progress.split_last(result.stage_times());
     Ok(result)
-}
-
-fn is_noted(interrupt: Option<&Interrupt>) -> bool {
-    interrupt.is_some_and(|interrupt| interrupt.noted().load(Ordering::Relaxed))
 }
 
 fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {

@@ -143,7 +143,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let video = video::finish(job.video.take(), &args.motion, answer)?;
     let assessment = progress.stage("inputs", |_| result.assess(&mut renderer, &options))?;
     let clip = clip.map(|of_video| of_video.video.clone());
-    let curve = curve.points().to_vec();
+    let curve = curve.into_points();
     Done { model, result, options, scored, curve, assessment, files, video, clip }
         .finish(args, &plan, progress, answer)?;
     print_left_out(&plan.scene);

@@ -12,7 +12,6 @@ use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 use std::io::IsTerminal;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use subsplat_cli::commands::environment;
 use subsplat_cli::interrupt::Interrupt;
@@ -36,8 +35,7 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     // A file that one rank cannot read or write ends all of them.
     let config = agree(&mut *peers, TrainConfig::load(&args.config))?;
     let interrupt = Interrupt::watch();
-    let stop = interrupt.as_ref().map(Interrupt::noted);
-    let limits = Limits { minutes: args.minutes, steps: args.steps, stop };
+    let limits = Limits { minutes: args.minutes, steps: args.steps, stop: Some(interrupt.flag()) };
     let mut training = Training::open_shared(&config, &args.out, peers)?;
     let mut watch = Watch::new(&config, limits);
     let board = first.then(|| Board::create(&args.out)).transpose();
@@ -74,7 +72,7 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
     let saved = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
     let (done, steps) = (progress.step, config.steps);
-    let stopped = stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
+    let stopped = interrupt.is_noted();
     let how = if stopped { "stopped by Ctrl-C, " } else { "" };
     print_line(format!("{how}{done} of {steps} steps done{}", saved.unwrap_or_default()));
     answer.finish(&json!({

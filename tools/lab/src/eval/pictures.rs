@@ -363,8 +363,8 @@ impl<'a> PictureMaker<'a> {
         Ok(parents)
     }
 
-    /// The Gaussians that `run` makes, without those beyond the edges, of `parents`, by a model and for `inputs`, whose targets have
-    /// `ratio` times their side.
+    /// The Gaussians that `run` makes, without those beyond the edges, of `parents`, by a model and for `inputs`, whose
+    /// targets have `ratio` times their side.
     fn finished(
         &self,
         network: &Network<'_>,
