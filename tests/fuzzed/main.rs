@@ -27,7 +27,7 @@ fn stems(folder: &Path) -> BTreeSet<String> {
 #[test]
 fn every_input_of_the_corpus_is_answered() {
     let mut wrong = Vec::new();
-    for &(name, _) in targets::TARGETS {
+    for &(name, target) in targets::TARGETS {
         let archive = std::fs::read(fuzz().join(format!("corpus/{name}.zip"))).unwrap();
         let mut inputs = zip::ZipArchive::new(Cursor::new(archive)).unwrap();
         assert!(!inputs.is_empty(), "{name}: no input");
@@ -38,7 +38,7 @@ fn every_input_of_the_corpus_is_answered() {
             DeflateDecoder::new(&mut input).read_to_end(&mut bytes).unwrap();
             assert_eq!(bytes.len() as u64, input.size());
             let start = Instant::now();
-            let answered = catch_unwind(|| targets::call(name, &bytes)).is_ok();
+            let answered = catch_unwind(|| target(&bytes)).is_ok();
             let time = start.elapsed();
             if !answered || time > LIMIT {
                 wrong.push(format!(
@@ -51,18 +51,14 @@ fn every_input_of_the_corpus_is_answered() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
-/// A target without its program would not be fuzzed; a corpus without its target would not be read.
+/// A corpus without its target would not be read, and a target without its corpus would begin from nothing.
 #[test]
-fn targets_programs_and_corpora_have_the_same_names() {
+fn targets_and_corpora_have_the_same_names() {
     let names: BTreeSet<String> =
         targets::TARGETS.iter().map(|(name, _)| (*name).to_owned()).collect();
     assert_eq!(names.len(), targets::TARGETS.len());
-    assert_eq!(stems(&fuzz().join("fuzz_targets")), names);
+    assert!(names.iter().all(|name| targets::target(name).is_some()));
     assert_eq!(stems(&fuzz().join("corpus")), names);
-    let manifest = std::fs::read_to_string(fuzz().join("Cargo.toml")).unwrap();
-    for name in &names {
-        assert!(manifest.contains(&format!("name = \"{name}\"")), "{name} is not in Cargo.toml");
-    }
     let readme = std::fs::read_to_string(fuzz().join("README.md")).unwrap();
     names.iter().for_each(|name| {
         assert!(readme.contains(&format!("`{name}`")), "{name} is not in the README")

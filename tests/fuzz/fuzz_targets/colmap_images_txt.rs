@@ -1,7 +1,0 @@
-//! The target `colmap_images_txt` of `subsplat_fuzz::targets`.
-#![no_main]
-
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call(
-    "colmap_images_txt",
-    bytes
-));

@@ -1,4 +1,0 @@
-//! The target `record3d` of `subsplat_fuzz::targets`.
-#![no_main]
-
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| subsplat_fuzz::targets::call("record3d", bytes));
