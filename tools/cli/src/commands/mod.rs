@@ -10,6 +10,7 @@ pub mod args;
 mod browser;
 mod check;
 mod clip;
+mod convention;
 mod curve;
 pub mod depth_colour;
 pub mod environment;

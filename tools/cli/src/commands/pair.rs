@@ -1,6 +1,7 @@
 //! The scene of the command line: a scene's path, or photographs with given or estimated cameras.
 
 use super::args::{PairArgs, PoseConventionArg, ReadArgs};
+use super::convention::fitting;
 use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
@@ -52,7 +53,8 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
         );
     }
     let convention = args.pose_convention.map(PoseConvention::from);
-    let scene = load_scene_with(one, &args.read.options(convention))?;
+    let options = args.read.options(convention);
+    let scene = load_scene_with(one, &options)?;
     ensure!(
         convention.is_none() || WITH_CONVENTION.contains(&scene.source),
         "--pose-convention: expected two photographs, or a scene with poses.txt, transforms.json or \
@@ -60,6 +62,9 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
         one.display(),
         scene.source.name()
     );
+    if convention.is_none() && WITH_CONVENTION.contains(&scene.source) {
+        return fitting(one, scene, &options);
+    }
     Ok(scene)
 }
 

@@ -38,12 +38,20 @@ fn models_pictures_and_axes_are_chosen() {
     std::fs::write(at("other/transforms.json"), text).unwrap();
     let reports = |arguments: &str| {
         let call = format!("--json check other --context 0,2 -o out {arguments}");
-        call_in(place.path(), &call).json()["pairs"][0].clone()
+        let called = call_in(place.path(), &call);
+        let line = called.stderr.lines().find(|l| l.contains("are read as")).map(str::to_owned);
+        (called.json()["pairs"][0].clone(), line)
     };
-    let (wrong, right) = (reports(""), reports("--pose-convention opencv-c2w"));
+    let (wrong, unsaid) = reports("--pose-convention opengl-c2w");
+    let (right, said) = reports("--pose-convention opencv-c2w");
     assert_ne!(wrong["baseline"], Value::Null);
     assert_eq!(wrong["baseline"], right["baseline"]);
     assert_ne!(wrong["overlap"], right["overlap"], "{wrong} {right}");
+    // Without the flag, the convention that fits the photographs is found.
+    let (found, line) = reports("");
+    assert_eq!((&found, unsaid, said), (&right, None, None));
+    let line = line.unwrap();
+    assert!(line.contains("other") && line.contains("opencv-c2w"), "{line}");
 }
 
 /// Entries that are left out are listed at the end, and `render` refuses splats that are no numbers.
