@@ -1,4 +1,5 @@
-//! Peak memory of whole runs, as the program itself reports it (`VmHWM`).
+//! Peak memory of whole runs, as the program itself reports it (`VmHWM`), and the memory of a process that makes many
+//! scenes.
 
 use subsplat_test_support::whole;
 
@@ -6,6 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use subsplat::files::photos::image::save_png;
 use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::{Options, Photo, Reconstructor};
 
 /// Largest difference between the peaks of runs with small and with large photographs, MiB.
 const LARGE_PHOTOGRAPHS: f64 = 8.0;
@@ -100,4 +102,52 @@ fn large_photographs_are_freed_before_the_network() {
     });
     let [small, large] = peaks;
     assert!(large - small <= LARGE_PHOTOGRAPHS, "{large:.0} MiB instead of {small:.0}");
+}
+
+/// MiB of this process that are in memory.
+#[cfg(target_os = "linux")]
+fn resident() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() / 1024.0
+}
+
+/// All numbers of the scene of two photographs, as bits.
+fn scene_bits(model: &Reconstructor, photos: &[Photo]) -> Vec<u32> {
+    let scene = model.run(photos, &Options::default().with_input_size(64, 64)).unwrap();
+    let splats = scene.splats();
+    splats.rows().iter().chain(splats.sh()).map(|v| v.to_bits()).collect()
+}
+
+/// Scenes one after another, then several at once: each has the bytes of the first, and the memory does not grow with
+/// their number. `SUBSPLAT_RUNS` and `SUBSPLAT_THREADS` set the numbers.
+#[cfg(target_os = "linux")]
+#[test]
+fn many_scenes_in_one_process_are_equal_and_leave_nothing() {
+    /// MiB by which the memory may differ between two moments, whatever the number of scenes between them.
+    const NOISE: f64 = 24.0;
+    let number = |name: &str, few: usize| std::env::var(name).map_or(few, |n| n.parse().unwrap());
+    let (runs, threads) = (number("SUBSPLAT_RUNS", 8), number("SUBSPLAT_THREADS", 4));
+    let photos = whole::shoot(3, 2, 96, 96).photos;
+    let model = Reconstructor::shipped(2).unwrap();
+    let first = scene_bits(&model, &photos);
+    let half = runs / 2;
+    let mut memory = [0.0; 2];
+    for run in 0..runs {
+        assert!(scene_bits(&model, &photos) == first, "scene {run}");
+        memory[usize::from(run >= half)] = resident();
+    }
+    println!(
+        "{runs} scenes: {:.0} MiB after the first half, {:.0} after all",
+        memory[0], memory[1]
+    );
+    assert!(memory[1] - memory[0] < NOISE, "{memory:?} MiB");
+    std::thread::scope(|scope| {
+        let scenes: Vec<_> =
+            (0..threads).map(|_| scope.spawn(|| scene_bits(&model, &photos))).collect();
+        for (thread, scene) in scenes.into_iter().enumerate() {
+            assert!(scene.join().unwrap() == first, "thread {thread}");
+        }
+    });
+    println!("{threads} scenes at once: {:.0} MiB", resident());
 }

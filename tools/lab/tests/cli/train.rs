@@ -475,6 +475,44 @@ fn the_program_trains_and_goes_on() {
     assert!(code == 2 && stderr.contains("--minutes"), "{stderr}");
 }
 
+/// SIGKILL at moments that are spread over a training: each call goes on from the newest checkpoint, and the weights are
+/// those of a call that nothing stopped. `SUBSPLAT_KILLS` sets the number of kills.
+#[test]
+fn killed_trainings_get_the_weights_of_an_unstopped_one() {
+    let folder = tempfile::tempdir().unwrap();
+    // A checkpoint after every step.
+    let text = TINY.replace("PHASE", "depth") + "\n[checkpoint]\nminutes = 1e-6\n";
+    std::fs::write(folder.path().join("t.toml"), text).unwrap();
+    let weights =
+        |out: &str| std::fs::read(folder.path().join(out).join("weights.safetensors")).unwrap();
+    let start = std::time::Instant::now();
+    let (code, _, stderr) = call(folder.path(), "train t.toml --out whole");
+    assert_eq!(code, 0, "{stderr}");
+    let time = start.elapsed().as_secs_f64();
+    let kills: u32 = std::env::var("SUBSPLAT_KILLS").map_or(4, |n| n.parse().unwrap());
+    let mut reached = Vec::new();
+    for kill in 0..kills {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_subsplat-lab"));
+        command.args("train t.toml --out killed".split_whitespace()).current_dir(folder.path());
+        let nowhere = std::process::Stdio::null;
+        let mut child = command.stdout(nowhere()).stderr(nowhere()).spawn().unwrap();
+        // Parts of a whole training that are not multiples of each other.
+        let part = (0.15 + 0.618 * f64::from(kill)).fract() * 0.4;
+        std::thread::sleep(std::time::Duration::from_secs_f64(time * part));
+        child.kill().unwrap();
+        child.wait().unwrap();
+        reached.extend(checkpoint::steps(&folder.path().join("killed")).last());
+    }
+    assert!(
+        reached.is_sorted() && reached.iter().any(|step| (1..40).contains(step)),
+        "{reached:?}"
+    );
+    println!("{kills} kills, checkpoints of the steps {reached:?}");
+    let (code, _, stderr) = call(folder.path(), "train t.toml --out killed");
+    assert_eq!(code, 0, "{stderr}");
+    assert!(weights("killed") == weights("whole"));
+}
+
 /// SIGINT ends the program after a step, with a checkpoint and weights.
 #[cfg(unix)]
 #[test]
