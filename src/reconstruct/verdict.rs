@@ -83,7 +83,12 @@ impl SceneVerdict {
             percent(consistent)
         );
         let (trust, reason) = if shared < LEAST_SHARED {
-            (Trust::Wrong, little_shared(shared))
+            let reason = match misfit {
+                Some(_) => cause_of_wrong(misfit),
+                None if coverage < LEAST_COVERAGE => few_splats(coverage),
+                None => little_shared(shared),
+            };
+            (Trust::Wrong, reason)
         } else if consistent < WRONG_CONSISTENT || misfit.is_some() && low {
             (Trust::Wrong, format!("{agree}; {}", cause_of_wrong(misfit)))
         } else if parallax < LEAST_PARALLAX {
@@ -108,6 +113,14 @@ fn little_shared(shared: f64) -> String {
     format!(
         "the photographs share {} of what they show; take photographs that show most of the same things",
         percent(shared)
+    )
+}
+
+fn few_splats(coverage: f64) -> String {
+    format!(
+        "the splats cover {} of the photographs, so that nothing can be said of the surfaces; more splats, or more \
+         photographs of the same things, fill the gaps",
+        percent(coverage)
     )
 }
 
@@ -194,7 +207,15 @@ mod tests {
         assert!(verdict.trust == near && verdict.to_string().contains("1.1 % of the width"));
         let mut apart = agreement(1.0, 12.0);
         apart.shared = 0.1;
-        assert_eq!(judge(&apart, 0.95, &[]).trust, wrong);
+        let cause = |coverage, reports: &[PairReport]| {
+            let verdict = judge(&apart, coverage, reports);
+            assert_eq!(verdict.trust, wrong);
+            verdict.reason
+        };
+        assert!(cause(0.95, &[]).contains("share 10 %"));
+        // Photographs that share little for another reason are not blamed.
+        assert!(cause(0.95, &poses).contains("cameras are the likeliest cause"));
+        assert!(cause(0.12, &[]).contains("splats cover 12 %"));
         // A scene that no photograph shares with another one has no agreement at all.
         assert_eq!(judge(&Agreement::default(), 0.0, &[]).trust, wrong);
     }

@@ -5,8 +5,10 @@ use super::edges::{self, Edge};
 use super::groups;
 use super::pair::{self, PairEstimate};
 use super::photo::PosePhoto;
+use super::reasons::{PoseRefusal, PoseWarning};
 use super::reconstruct::{self, Model, Point, midpoint};
 use super::refine::FocalPrior;
+use super::still;
 use super::tracks::FeatureId;
 use super::two_view::Bearings;
 use super::world;
@@ -89,116 +91,6 @@ pub struct LeftOut {
     pub reason: String,
 }
 
-/// A weakness of an estimate.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum PoseWarning {
-    /// Too little is known of the focal length.
-    #[error("the focal length is uncertain by {percent:.0} %")]
-    UncertainFocal {
-        /// Standard deviation, percent.
-        percent: f64,
-    },
-    /// The focal length is a result of two photographs alone.
-    #[error(
-        "the focal length ({focal_px:.0} px) was estimated from two photographs, which often fails: \
-         give --fov or --intrinsics, or more photographs"
-    )]
-    FocalOfTwo {
-        /// The focal length, px of the first photograph.
-        focal_px: f64,
-    },
-    /// Another pose explains the matches nearly as well.
-    #[error("another position of the cameras explains {percent:.0} % of what this one explains")]
-    Rival {
-        /// Support of the other pose, percent of the support of this one.
-        percent: f64,
-    },
-    /// Few matches support the pose.
-    #[error("only {count} matched points support the cameras")]
-    FewPoints {
-        /// Number of matches.
-        count: usize,
-    },
-    /// The statistical error is large.
-    #[error("the direction between the cameras is uncertain by {degrees:.1} degrees")]
-    UncertainDirection {
-        /// Standard deviation, degrees.
-        degrees: f64,
-    },
-    /// A refusal that [`Uncertain::Accept`] overrode.
-    #[error("{0}")]
-    Forced(PoseRefusal),
-}
-
-/// Reason for which photographs get no cameras.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum PoseRefusal {
-    /// Fewer than two photographs.
-    #[error("expected at least 2 photographs, got {count}")]
-    TooFew {
-        /// Number of photographs.
-        count: usize,
-    },
-    /// The photographs are equal.
-    #[error(
-        "the photographs show the same view: matched points move by {shift_px:.1} px at most; take \
-         the second photograph from a place a step aside"
-    )]
-    SameView {
-        /// Median shift of the matched points, px of a photograph of 640 px.
-        shift_px: f64,
-    },
-    /// The camera turned at one place.
-    #[error(
-        "the camera turned by {degrees:.0} degrees but did not move: points shift by \
-         {parallax_px:.1} px (of 640 px) beside the turn; take the second photograph from a place a \
-         step aside"
-    )]
-    PureRotation {
-        /// Angle of the rotation, degrees.
-        degrees: f64,
-        /// Median shift of the points beside the rotation, px of a photograph of 640 px.
-        parallax_px: f64,
-    },
-    /// Too few matches agree with one geometry.
-    #[error(
-        "only {consistent} of {matches} matched points agree with one position of the cameras \
-         ({needed} are needed): different places, a mirrored photograph, or too little in common; \
-         take photographs with more overlap and more texture"
-    )]
-    FewMatches {
-        /// Number of matches that agree.
-        consistent: usize,
-        /// Number of matches.
-        matches: usize,
-        /// Number that is needed.
-        needed: usize,
-    },
-    /// One of two photographs is mirrored.
-    #[error(
-        "one of the photographs is mirrored: {consistent} matched points agree with one position of \
-         the cameras once the second one is flipped left to right; flip one of them"
-    )]
-    Mirrored {
-        /// Number of matches that agree.
-        consistent: usize,
-    },
-    /// Several cameras explain the matches equally well.
-    #[error(
-        "two different positions of the cameras explain the matched points equally well ({percent:.0} \
-         %); take photographs of a scene that is less flat, or give --fov"
-    )]
-    Ambiguous {
-        /// Support of the second position, percent of the support of the first.
-        percent: f64,
-    },
-    /// No pair of photographs is wide enough to start with.
-    #[error("no two of the photographs have enough in common and enough distance")]
-    NoPair,
-}
-
 /// Cameras of photographs, sparse points, and how certain they are.
 ///
 /// World: +y down, the first camera with a pose at the origin, looking towards +z as far as the
@@ -277,7 +169,14 @@ pub fn estimate_poses(
     match photos {
         [a, b] => two(a, b, options),
         [] | [_] => Err(PoseRefusal::TooFew { count: photos.len() }),
-        _ => many(photos, options),
+        _ => match still::without_still(photos) {
+            None => many(photos, options),
+            Some((moving, share)) => {
+                let mut estimate = many(&moving, options)?;
+                estimate.warnings.push(PoseWarning::StandsStill { percent: 100.0 * share });
+                Ok(estimate)
+            }
+        },
     }
 }
 
@@ -540,6 +439,7 @@ fn finished(
     if !(direction < UNCERTAIN_DIRECTION) {
         warnings.push(PoseWarning::UncertainDirection { degrees: direction });
     }
+    warnings.extend(narrow_view(photos, scale));
     PoseEstimate {
         cameras: out,
         points,
@@ -550,6 +450,23 @@ fn finished(
         direction_error_deg: direction,
         warnings,
     }
+}
+
+/// Focal length over the longer side of a picture, above which an estimate is doubtful: 37 degrees, a lens of 54 mm.
+/// Estimates of stereo pictures side by side, of files of two fisheye lenses and of panoramas without their zenith have
+/// 1.52, 1.72 and 1.58.
+const LONG_FOCAL: f64 = 1.5;
+
+/// Warns of a focal length `scale` times the lenses' where none is stated and the result is that of a long lens.
+fn narrow_view(photos: &[&PosePhoto], scale: f64) -> Option<PoseWarning> {
+    let focal = |photo: &&PosePhoto| {
+        let k = photo.lens.intrinsics;
+        f64::from(k.fx.max(k.fy)) * scale / k.width.max(k.height) as f64
+    };
+    let unknown = photos.iter().filter(|photo| photo.lens.deviation > STATED);
+    let longest = unknown.map(focal).fold(0.0, f64::max);
+    let degrees = 2.0 * (0.5 / longest).atan().to_degrees();
+    (longest > LONG_FOCAL).then_some(PoseWarning::NarrowView { degrees })
 }
 
 /// A point with its colour, observations in px and error.

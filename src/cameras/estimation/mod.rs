@@ -6,6 +6,8 @@
 //!
 //! A panorama is a photograph of several views with one centre (`views.rs`).
 //!
+//! Features that stand still in the picture are left out (`still.rs`).
+//!
 //! Cameras that are nearly right are adjusted by [`adjust_poses`] (`adjust.rs`).
 //!
 //! Two photographs: points are matched, an essential matrix is estimated and refined
@@ -24,8 +26,10 @@ mod groups;
 mod pair;
 mod photo;
 mod ransac;
+mod reasons;
 mod reconstruct;
 mod refine;
+mod still;
 mod tracks;
 mod two_view;
 mod views;
@@ -33,8 +37,9 @@ mod world;
 
 pub use adjust::{CERTAIN_POINTS, PoseAdjustment, adjust_poses, locate_photos, move_along};
 pub use estimate::{
-    Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
-    PoseWarning, Uncertain, estimate_poses,
+    Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, Uncertain,
+    estimate_poses,
 };
 pub use photo::{Lens, PosePhoto, PosePhotoError};
+pub use reasons::{PoseRefusal, PoseWarning};
 pub use views::PhotoView;

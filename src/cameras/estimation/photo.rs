@@ -1,6 +1,7 @@
 //! A photograph for pose estimation: its features and what is known of its lens.
 
 use super::two_view::Bearings;
+use crate::cameras::matches::descriptors::DESCRIPTOR;
 use crate::cameras::matches::features;
 use crate::cameras::matches::features::{Features, Orientation};
 use crate::cameras::matches::pairs::Pair;
@@ -223,6 +224,18 @@ impl PosePhoto {
         photo.lens.deviation = 0.0;
         let all = 0..photo.features.points.len();
         photo.bearings = all.map(|i| photo.bearing(photo.position(i))).collect();
+        photo
+    }
+
+    /// The same photograph without the features that `left_out` marks.
+    pub(super) fn without(&self, left_out: &[bool]) -> Self {
+        let mut photo = self.clone();
+        let kept: Vec<usize> = (0..self.feature_count()).filter(|&i| !left_out[i]).collect();
+        photo.features.points = kept.iter().map(|&i| self.features.points[i].clone()).collect();
+        photo.bearings = kept.iter().map(|&i| self.bearings[i]).collect();
+        photo.colours = kept.iter().filter_map(|&i| self.colours.get(i).copied()).collect();
+        let row = |&i: &usize| &self.features.descriptors[i * DESCRIPTOR..(i + 1) * DESCRIPTOR];
+        photo.features.descriptors = kept.iter().flat_map(row).copied().collect();
         photo
     }
 

@@ -368,9 +368,8 @@ fn check_jpeg(
 /// Least alpha of a pixel that counts.
 const ALPHA_KEPT: u8 = 128;
 
-/// Rounds to 8 bits, and makes a mask of an alpha channel. An alpha of 0 everywhere is no alpha: some writers
-/// of BMP and TIFF leave a fourth band of zeros. A mask is an alpha that is not the same everywhere and masks
-/// a pixel. Transparency is blended with black, but for pixels that a mask keeps: those at the rim of an
+/// Rounds to 8 bits, and makes a mask of an alpha channel. An alpha that is the same everywhere is none: some writers
+/// of BMP and TIFF leave a fourth band of zeros. A mask is an alpha that masks a pixel. Transparency is blended with black, but for pixels that a mask keeps: those at the rim of an
 /// object would be darker than it.
 fn to_rgb(pixels: DynamicImage) -> (Rgb, Option<Mask>) {
     let (width, height) = (pixels.width() as usize, pixels.height() as usize);
@@ -382,10 +381,10 @@ fn to_rgb(pixels: DynamicImage) -> (Rgb, Option<Mask>) {
     let rgba = pixels.to_rgba8().into_raw();
     let alphas = || rgba.chunks_exact(4).map(|p| p[3]);
     let [least, most] = alphas().fold([u8::MAX, 0], |[least, most], a| [least.min(a), most.max(a)]);
-    if most == 0 {
+    if least == most {
         return opaque(pixels);
     }
-    let masks = least < ALPHA_KEPT && least < most;
+    let masks = least < ALPHA_KEPT;
     let over_black = |v: u8, a: u8| ((u32::from(v) * u32::from(a) + 127) / 255) as u8;
     let blend = |p: &[u8]| {
         let alpha = if masks && p[3] >= ALPHA_KEPT { u8::MAX } else { p[3] };
@@ -455,6 +454,16 @@ mod tests {
             assert_eq!(picture.data[..3], first, "{extra:?}");
             assert_eq!(mask.unwrap().kept(), [true, false], "{extra:?}");
             assert!(lines.len() == 1 && lines[0].contains("used as a mask"), "{lines:?}");
+        }
+    }
+
+    #[test]
+    fn an_alpha_that_is_the_same_everywhere_is_none() {
+        for alpha in [0, 1, 128, 255] {
+            let pixels = [[100, 60, 20, alpha], [90, 50, 10, alpha]];
+            let (picture, lines, mask) = read_bytes(&four_bands(pixels, None));
+            assert_eq!(picture.data, [100, 60, 20, 90, 50, 10], "{alpha}");
+            assert!(mask.is_none() && lines.is_empty(), "{alpha}: {lines:?}");
         }
     }
 

@@ -6,7 +6,7 @@ use super::video::is_video;
 use super::{heic, jxl, raw};
 use crate::files::poses::assemble::{files, has_extension};
 use crate::files::{Error, first_bytes, lower_extension};
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 /// Extensions of pictures beside the usual ones and the raw ones; some of the formats are not read.
@@ -97,7 +97,42 @@ fn in_folder(folder: &Path) -> FolderPhotographs {
         found.left_out.push([name, reason]);
     }
     leave_out_twins(&mut found);
+    leave_out_copies(&mut found);
     found
+}
+
+/// Leaves out files that equal another one byte for byte, such as `a (1).jpg` beside `a.jpg`: they show one place. The
+/// one with the shortest name stays.
+fn leave_out_copies(found: &mut FolderPhotographs) {
+    let mut of_size: HashMap<u64, Vec<usize>> = HashMap::new();
+    for (i, path) in found.photographs.iter().enumerate() {
+        // A file without a size is an error of its reader.
+        if let Ok(metadata) = path.metadata() {
+            of_size.entry(metadata.len()).or_default().push(i);
+        }
+    }
+    let name = |i: usize| {
+        let path: &Path = &found.photographs[i];
+        path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+    };
+    let mut copies: Vec<(usize, String)> = Vec::new();
+    for mut same in of_size.into_values().filter(|same| same.len() > 1) {
+        same.sort_by_key(|&i| (name(i).len(), i));
+        let mut kept: Vec<(usize, Vec<u8>)> = Vec::new();
+        for i in same {
+            let Ok(bytes) = std::fs::read(&found.photographs[i]) else { continue };
+            match kept.iter().find(|(_, other)| *other == bytes) {
+                Some((first, _)) => copies.push((i, format!("a copy of {}", name(*first)))),
+                None => kept.push((i, bytes)),
+            }
+        }
+    }
+    copies.sort();
+    for (i, reason) in copies.iter().rev() {
+        let path = found.photographs.remove(*i);
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        found.left_out.push([name, reason.clone()]);
+    }
 }
 
 /// Leaves out raw, HEIC, AVIF and JPEG XL files beside a JPEG, PNG or TIFF of the same name: two photographs from one
@@ -164,9 +199,8 @@ mod tests {
     fn pictures_are_found_by_content_and_others_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
-        let picture = Rgb::black(4, 3);
-        for name in ["b10.png", "b9.jfif", "c"] {
-            save_png(path("x.png"), &picture).unwrap();
+        for (height, name) in ["b10.png", "b9.jfif", "c"].into_iter().enumerate() {
+            save_png(path("x.png"), &Rgb::black(4, 3 + height)).unwrap();
             std::fs::rename(path("x.png"), path(name)).unwrap();
         }
         for (name, bytes) in [
@@ -191,6 +225,18 @@ mod tests {
             ..Default::default()
         };
         assert_eq!(many.notes(), ["left out: a, b, c and 1 more: no"]);
+        // Copies: of equal bytes, the shortest name stays.
+        for copy in ["b10 (1).png", "b10 (2).png"] {
+            std::fs::copy(path("b10.png"), path(copy)).unwrap();
+        }
+        let mut cropped = std::fs::read(path("b10.png")).unwrap();
+        *cropped.last_mut().unwrap() ^= 1;
+        std::fs::write(path("a.png"), cropped).unwrap();
+        let found = find_photographs(folder.path());
+        assert_eq!(found.photographs, ["a.png", "b9.jfif", "b10.png", "c"].map(path));
+        let copies = found.notes().into_iter().find(|note| note.contains("a copy of b10.png"));
+        assert!(copies.is_some_and(|n| n.contains("b10 (2).png, b10 (1).png")), "{found:?}");
+        ["a.png", "b10 (1).png", "b10 (2).png"].map(|n| std::fs::remove_file(path(n)).unwrap());
         // A folder of nothing but `images`.
         std::fs::create_dir(path("inner")).unwrap();
         std::fs::rename(path("c"), path("inner/c")).unwrap();

@@ -312,8 +312,9 @@ mod tests {
         let path = folder.path().join("a.png");
         image::GrayImage::from_raw(1, 1, vec![77]).unwrap().save(&path).unwrap();
         assert_eq!(load(&path).unwrap().data, [77; 3]);
-        image::RgbaImage::from_raw(1, 1, vec![200, 100, 255, 128]).unwrap().save(&path).unwrap();
-        assert_eq!(load(&path).unwrap().data, [100, 50, 128]);
+        let colours = vec![200, 100, 255, 128, 9, 8, 7, 255];
+        image::RgbaImage::from_raw(2, 1, colours).unwrap().save(&path).unwrap();
+        assert_eq!(load(&path).unwrap().data, [100, 50, 128, 9, 8, 7]);
         let deep: image::ImageBuffer<image::Rgb<u16>, _> =
             image::ImageBuffer::from_raw(1, 1, vec![257u16 * 9, 257 * 9 + 200, 65535]).unwrap();
         image::DynamicImage::ImageRgb16(deep).save(&path).unwrap();

@@ -115,3 +115,19 @@ fn uncertain_cameras_have_warnings() {
     let direction = warnings(0.0, 1.02 * 1.5).warnings;
     assert!(matches!(direction[..], [PoseWarning::UncertainDirection { .. }]));
 }
+
+#[test]
+fn an_unknown_lens_that_comes_out_long_is_doubted() {
+    let warnings = |deviation: f64, scale: f64| {
+        let a = photo(deviation);
+        narrow_view(&[&a, &a], scale)
+    };
+    // The focal length is the photographs' width times the scale.
+    assert_eq!(warnings(0.35, 0.98 * 1.5), None);
+    let narrow = warnings(0.35, 1.02 * 1.5);
+    assert!(
+        matches!(narrow, Some(PoseWarning::NarrowView { degrees }) if (degrees - 36.2).abs() < 0.1)
+    );
+    // The file states it.
+    assert_eq!(warnings(0.03, 2.0), None);
+}

@@ -17,7 +17,9 @@ use subsplat::scene::pictures::Rgb;
 /// Runs the command; returns `false` where the poses are judged bad.
 pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
     let mut progress = Progress::new();
-    let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.pair, bar))?;
+    let wanted = [("--context", args.context.as_slice())];
+    let pair::Loaded { scene, .. } =
+        progress.stage("scene", |bar| pair::load(&args.input, &args.pair, &wanted, bar))?;
     scene.warnings.iter().for_each(print_warning);
     let pairs = pairs(args, &scene)?;
     print_line(format!(

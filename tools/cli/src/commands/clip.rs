@@ -45,7 +45,7 @@ pub fn of_run(args: &RunArgs, progress: &mut Progress) -> Result<Option<OfVideo<
         return Ok(None);
     };
     // The frames are written into this folder.
-    output::check(&args.out)?;
+    output::check(&args.out, &args.input)?;
     let mut frames = args.clone();
     let count = match args.take {
         // Without a path, --frames has no other meaning for a video.

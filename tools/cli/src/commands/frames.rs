@@ -3,7 +3,7 @@
 use super::pair::folder_of;
 use anyhow::{Context, Result, bail, ensure};
 use glam::{Mat4, Quat, Vec3};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use subsplat::files::poses::protocol::{Views, load_protocol};
 use subsplat::files::poses::scene::{Scene, frame_name};
 use subsplat_kernels::camera::Camera;
@@ -12,25 +12,21 @@ fn stem(file: &str) -> String {
     frame_name(file).rsplit('/').next().unwrap_or_default().to_owned()
 }
 
-/// Finds the frames that the words of `flag` name: by index, or by name with or without folder
-/// and extension. Digits with leading zeros are a name.
+/// Finds the frames that the words of `flag` name: by index, or by name with or without folder and extension. A number
+/// that is the name of one frame is a name: of files 1.jpg, 2.jpg, …, `1` is the first, and not the second frame.
 pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>> {
     let one = |word: &String| -> Result<usize> {
         if let Ok(i) = word.parse::<usize>()
             && i < frames.len()
             && i.to_string() == *word
+            && frames.iter().filter(|f| stem(f) == *word).count() != 1
         {
             return Ok(i);
         }
         let exact = frames.iter().any(|f| f == word);
         let is_same = |f: &str| if exact { f == word } else { stem(f) == stem(word) };
         let mut same = (0..frames.len()).filter(|&i| is_same(frames[i]));
-        let found = same.next().with_context(|| {
-            format!(
-                "{flag}: expected a number below {} or a photograph's name, got `{word}`",
-                frames.len()
-            )
-        })?;
+        let found = same.next().with_context(|| expected_frame(flag, frames.len(), word))?;
         if let Some(other) = same.next() {
             bail!(
                 "{flag}: `{word}` may be photograph {found} ({}) or {other} ({}): give the number",
@@ -41,6 +37,27 @@ pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>
         Ok(found)
     };
     wanted.iter().map(one).collect()
+}
+
+/// Refuses words of flags that can name none of the photographs, each with its flag.
+///
+/// # Errors
+/// The first such word.
+pub fn check_words(photographs: &[PathBuf], wanted: &[(&str, &[String])]) -> Result<()> {
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let names: Vec<String> = photographs.iter().map(name).collect();
+    for (flag, words) in wanted {
+        for word in *words {
+            let is_number = word.parse::<usize>().is_ok_and(|i| i < names.len());
+            let known = is_number || names.iter().any(|name| stem(name) == stem(word));
+            ensure!(known, expected_frame(flag, names.len(), word));
+        }
+    }
+    Ok(())
+}
+
+fn expected_frame(flag: &str, count: usize, word: &str) -> String {
+    format!("{flag}: expected a number below {count} or a photograph's name, got `{word}`")
 }
 
 /// Finds frames of a scene by [`pick`]. Numbers are those of the pose file's entries, so that an entry that is
@@ -371,7 +388,9 @@ mod tests {
         let pick = |word: &str| super::pick(&frames, &[word.to_owned()], "--target");
         for (word, expected) in [
             ("0", 0),
-            ("1", 1),
+            ("3", 3),
+            // A name before an index.
+            ("1", 4),
             ("0001", 0),
             ("0012.jpg", 1),
             ("images/0001.png", 0),
@@ -379,7 +398,7 @@ mod tests {
         ] {
             assert_eq!(pick(word).unwrap(), [expected], "{word}");
         }
-        // `2` is an index; `2.png` is a name that two frames have.
+        // `2` is an index, because two frames have the name `2`.
         assert_eq!(pick("2").unwrap(), [2]);
         for (word, hint) in [("2.png", "give the number"), ("9", "below 5"), ("", "below 5")] {
             let error = pick(word).unwrap_err().to_string();

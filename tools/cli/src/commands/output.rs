@@ -15,10 +15,11 @@ use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
-use std::path::Path;
-use subsplat::files::photos::image::{save_depth_png, save_png};
+use std::path::{Path, PathBuf};
+use subsplat::files::photos::folder::find_photographs;
+use subsplat::files::photos::image::{probe, save_depth_png, save_png};
 use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::files::poses::scene::{Scene, is_scene};
+use subsplat::files::poses::scene::{Scene, has_scene, is_scene};
 use subsplat::files::{SaveOptions, save_splats};
 use subsplat::network::config::Config;
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
@@ -76,21 +77,45 @@ impl Scored {
     }
 }
 
-/// Refuses an output folder that a run cannot use, whatever it reads. It creates nothing.
+/// Refuses an output folder that a run of `input` cannot use. It creates nothing.
 ///
 /// # Errors
-/// No folder; a folder with the poses of a scene, which the new cameras.json would overwrite or hide.
-pub fn check(out: &Path) -> Result<()> {
-    ensure!(
-        !out.exists() || out.is_dir(),
-        "output folder {}: expected a folder, got a file",
-        out.display()
-    );
+/// No folder; a folder with the poses of a scene, which the new cameras.json would overwrite or hide; the folder in
+/// which the photographs of `input` lie, which later runs would take for rendered pictures.
+pub fn check(out: &Path, input: &[PathBuf]) -> Result<()> {
+    let whole = std::path::absolute(out).with_context(|| out.display().to_string())?;
+    let file = whole.ancestors().find(|part| part.exists()).filter(|part| !part.is_dir());
+    if let Some(file) = file {
+        bail!(
+            "output folder {}: expected a folder, got a file ({})",
+            out.display(),
+            file.display()
+        );
+    }
+    let real = std::fs::canonicalize(out).ok();
+    let of_pictures = |path: &PathBuf| {
+        let folder = match path.is_dir() {
+            true if has_scene(path) || find_photographs(path).photographs.is_empty() => {
+                return false;
+            }
+            true => path.as_path(),
+            false if probe(path).is_err() => return false,
+            false => folder_of(path),
+        };
+        real.is_some() && std::fs::canonicalize(folder).ok() == real
+    };
+    if input.iter().any(of_pictures) {
+        bail!(holds_photographs(out));
+    }
     // A cameras.json may be that of an earlier run, which is replaced.
     if is_scene(out) && !out.join("cameras.json").is_file() {
         bail!(holds_poses(out));
     }
     Ok(())
+}
+
+fn holds_photographs(out: &Path) -> String {
+    format!("output folder {}: holds the photographs that are read; choose another", out.display())
 }
 
 fn holds_poses(out: &Path) -> String {
@@ -117,10 +142,7 @@ pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
         let image = std::fs::canonicalize(&frame.image);
         let within = |folder: &str| image.as_ref().is_ok_and(|i| i.starts_with(real.join(folder)));
         if FOLDERS.into_iter().any(within) {
-            bail!(
-                "output folder {}: holds the photographs that are read; choose another",
-                out.display()
-            );
+            bail!(holds_photographs(out));
         }
     }
     let own = scene.source.has_file()
@@ -128,7 +150,6 @@ pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
     if own {
         bail!(holds_poses(out));
     }
-    check(out)?;
     remove_earlier(out);
     FOLDERS.iter().try_for_each(|f| make(&out.join(f)))
 }

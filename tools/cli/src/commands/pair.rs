@@ -2,6 +2,7 @@
 
 use super::args::{PairArgs, PoseConventionArg, ReadArgs};
 use super::convention::fitting;
+use super::frames;
 use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
@@ -23,16 +24,36 @@ use subsplat_kernels::camera::{Camera, Intrinsics};
 const WITH_CONVENTION: [SceneFormat; 3] =
     [SceneFormat::Matrices, SceneFormat::Transforms, SceneFormat::Polycam];
 
-/// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones.
-pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Scene> {
+/// A scene, and whether its cameras are an estimate of low confidence.
+pub struct Loaded {
+    pub scene: Scene,
+    pub doubtful: bool,
+}
+
+impl From<Scene> for Loaded {
+    /// A scene whose cameras are given.
+    fn from(scene: Scene) -> Self {
+        Self { scene, doubtful: false }
+    }
+}
+
+/// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones. `wanted` are the words of
+/// flags that name photographs: words that name none are refused before cameras are estimated.
+pub fn load(
+    input: &[PathBuf],
+    args: &PairArgs,
+    wanted: &[(&str, &[String])],
+    bar: &ProgressBar,
+) -> Result<Loaded> {
     if let ([a, b], true) = (input, args.has_pose()) {
         ensure!(args.lens.is_none(), "--lens: only without --move and --pose-b");
-        return of_photographs(a, b, args);
+        return of_photographs(a, b, args).map(Loaded::from);
     }
     if let Some(photographs) = photographs(input, &args.read)? {
         if let Some(flag) = args.first_pose_flag() {
             bail!("{flag}: expected two photographs with --move or --pose-b, got neither flag");
         }
+        frames::check_words(&photographs, wanted)?;
         let options = EstimateRequest {
             fov: args.fov,
             intrinsics: args.intrinsics.as_deref(),
@@ -41,7 +62,8 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
         };
         let estimated = estimate(&input[0], &photographs, &options, bar)?;
         bar.suspend(|| print_estimate(&estimated));
-        return Ok(estimated.scene);
+        let doubtful = estimated.estimate.confidence == Confidence::Low;
+        return Ok(Loaded { scene: estimated.scene, doubtful });
     }
     let [one] = input else {
         bail!("expected photographs, or one scene, got {} paths", input.len())
@@ -63,9 +85,9 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
         scene.source.name()
     );
     if convention.is_none() && WITH_CONVENTION.contains(&scene.source) {
-        return fitting(one, scene, &options);
+        return fitting(one, scene, &options).map(Loaded::from);
     }
-    Ok(scene)
+    Ok(scene.into())
 }
 
 /// The photographs that `input` names: two or more files and folders, or a folder without cameras. `None`
@@ -121,6 +143,12 @@ pub fn photographs(input: &[PathBuf], read: &ReadArgs) -> Result<Option<Vec<Path
     let mut all = Vec::with_capacity(input.len());
     for path in input {
         if path.is_dir() {
+            if has_scene(path) {
+                print_warning(format!(
+                    "{}: its cameras are not used: those of photographs of several inputs are estimated together",
+                    path.display()
+                ));
+            }
             let found = find_photographs(path);
             say_left_out(path, &found, read.strict)?;
             ensure!(
@@ -141,8 +169,7 @@ pub fn photographs(input: &[PathBuf], read: &ReadArgs) -> Result<Option<Vec<Path
 fn say_left_out(folder: &Path, found: &FolderPhotographs, strict: bool) -> Result<()> {
     if let (true, [[name, reason], ..]) = (strict, found.left_out.as_slice()) {
         bail!(
-            "{}: expected pictures that can be read (--strict), got {} that cannot: the first is {name} \
-             ({reason})",
+            "{}: expected no picture that is left out (--strict), got {}: the first is {name} ({reason})",
             folder.display(),
             found.left_out.len()
         );
@@ -251,14 +278,18 @@ pub fn print_estimate(estimated: &EstimatedScene) {
         Confidence::High => "reliable",
         Confidence::Low => "DOUBTFUL",
     };
+    let about = |degrees: f64| match degrees.is_finite() {
+        true => format!("about {degrees:.2}°"),
+        false => "unknown".to_owned(),
+    };
     print_line(format!(
         "the cameras of {placed} of {} photographs were estimated from {} shared points: {certain} \
-         (error of rotations about {:.2}°, of directions between cameras about {:.2}°); the unit of \
-         length is the median distance of the points",
+         (error of rotations {}, of directions between cameras {}); the unit of length is the median \
+         distance of the points",
         estimate.cameras.len(),
         estimate.points.len(),
-        estimate.rotation_error_deg,
-        estimate.direction_error_deg,
+        about(estimate.rotation_error_deg),
+        about(estimate.direction_error_deg),
     ));
     if let Some((camera, source)) =
         estimate.cameras.iter().zip(&estimated.lenses).find_map(|(c, s)| Some(((*c)?, s)))

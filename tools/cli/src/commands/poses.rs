@@ -129,7 +129,10 @@ fn real(path: &Path) -> Result<PathBuf> {
     let whole = std::path::absolute(path).with_context(context)?;
     let existing = whole.ancestors().find(|part| part.exists()).unwrap_or(&whole);
     let rest = whole.strip_prefix(existing).unwrap_or(Path::new(""));
-    Ok(std::fs::canonicalize(existing).with_context(context)?.join(rest))
+    let mut real = std::fs::canonicalize(existing).with_context(context)?;
+    // Joined as a whole, an empty rest would add a slash.
+    real.extend(rest.components());
+    Ok(real)
 }
 
 /// The path from a folder to a file, both absolute.

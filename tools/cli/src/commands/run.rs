@@ -47,6 +47,8 @@ struct Plan {
     scene: Scene,
     context: Vec<usize>,
     options: Options,
+    /// The cameras are an estimate of low confidence.
+    doubtful: bool,
 }
 
 /// Runs the command.
@@ -56,10 +58,12 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let of_video = clip::of_run(args, &mut progress)?;
     let clip = of_video.as_ref();
     let args = clip.map_or(args, |of_video| &of_video.args);
-    let mut plan = plan(args, clip.map(OfVideo::scene_name), &mut progress)?;
+    output::check(&args.out, &args.input)?;
+    // Before the cameras: weights that cannot be read are an error before any work.
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);
     let model = progress.stage("model", |_| model::load(&request))?.with_backend(&backend);
+    let mut plan = plan(args, clip.map(OfVideo::scene_name), &mut progress)?;
     let source = &args.source;
     let target = args.target_size();
     let context = &plan.context;
@@ -188,8 +192,10 @@ fn backend(device: &str) -> Backend {
 
 /// Checks the arguments and reads the scene, which gets the name `name`.
 fn plan(args: &RunArgs, name: Option<String>, progress: &mut Progress) -> Result<Plan> {
-    let mut scene =
-        progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
+    let source = &args.source;
+    let wanted = [("--context", source.context.as_slice()), ("--target", args.target.as_slice())];
+    let pair::Loaded { mut scene, doubtful } =
+        progress.stage("scene", |bar| pair::load(&args.input, &source.pair, &wanted, bar))?;
     scene.name = name.unwrap_or(scene.name);
     scene.warnings.iter().for_each(print_warning);
     let (context, reason) = context(&args.source, &args.input[0], &scene)?;
@@ -200,7 +206,7 @@ fn plan(args: &RunArgs, name: Option<String>, progress: &mut Progress) -> Result
         scene.source.name(),
     ));
     let options = reconstruct::options(&args.source, &scene, &context)?;
-    Ok(Plan { scene, context, options })
+    Ok(Plan { scene, context, options, doubtful })
 }
 
 /// Loads the photographs of a scene's `context` frames; `force` accepts truncated files. Prints the warnings about
@@ -298,7 +304,7 @@ pub fn context(args: &SourceArgs, input: &Path, scene: &Scene) -> Result<(Vec<us
                 "--context: expected different photographs, got {name} twice"
             );
         }
-        let text = format!("{}, as given", list(&chosen));
+        let text = format!("{}, as given", named.join(","));
         return Ok((chosen, text));
     }
     if scene.frames.len() == 2 {
@@ -540,6 +546,11 @@ impl Done {
             peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
         ));
         answer.line(&self.assessment.verdict);
+        if plan.doubtful {
+            print_warning(
+                "the estimated cameras are doubtful, and with them every view of the scene",
+            );
+        }
         if args.formats().contains(&SceneFormatArg::Html) {
             let page = args.out.join(SceneFormatArg::Html.file_name());
             answer.line(format!("to look around in the scene, open {}", page.display()));

@@ -3,6 +3,7 @@
 use super::args::{InputSizeArg, PictureSizeArg};
 use subsplat::files::splats::spz::SpzVersion;
 use subsplat::reconstruct::{FisheyeCurve, FisheyeLens, Projection};
+use subsplat::scene::metrics::SSIM_WINDOW;
 use subsplat::{Density, Refine};
 use subsplat_kernels::camera::Intrinsics;
 use subsplat_kernels::layout::CHILDREN_MAX;
@@ -224,14 +225,17 @@ pub fn size(text: &str) -> Result<(usize, usize), String> {
     sides.map_err(|_| format!("expected N or WxH, 1 to {most} pixels a side"))
 }
 
-/// Parses [`size`], or `photo`.
+/// Parses [`size`] from 11 px on, the window of SSIM, which compares pictures with photographs; or `photo`.
 pub fn picture_size(text: &str) -> Result<PictureSizeArg, String> {
-    match text {
-        "photo" => Ok(PictureSizeArg::Photo),
-        _ => match size(text) {
-            Ok((width, height)) => Ok(PictureSizeArg::Sides(width, height)),
-            Err(expected) => Err(format!("{expected}, or `photo`")),
-        },
+    match (text, size(text)) {
+        ("photo", _) => Ok(PictureSizeArg::Photo),
+        (_, Ok((width, height))) if width.min(height) >= SSIM_WINDOW => {
+            Ok(PictureSizeArg::Sides(width, height))
+        }
+        _ => {
+            let (least, most) = (SSIM_WINDOW, Intrinsics::SIDE_MAX);
+            Err(format!("expected N or WxH, {least} to {most} pixels a side, or `photo`"))
+        }
     }
 }
 
@@ -323,6 +327,10 @@ mod tests {
         assert_eq!(input_size("256x256"), Ok(InputSizeArg::Sides(256, 256)));
         for bad in ["", "0", "12x", "x12", "3x0", "-3", "1e9", "99999999999999999999", "32769"] {
             assert!(size(bad).unwrap_err().contains("N or WxH"), "{bad}");
+        }
+        assert_eq!(picture_size("11x40"), Ok(PictureSizeArg::Sides(11, 40)));
+        for bad in ["10", "40x10", "photos"] {
+            assert!(picture_size(bad).unwrap_err().contains("11 to 32768"), "{bad}");
         }
     }
 

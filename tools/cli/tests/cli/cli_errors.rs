@@ -99,7 +99,7 @@ fn broken_files() {
     edit("unclosed", "}", "");
     std::fs::write(at("scene.ply"), "ply\nformat binary_little_endian 1.0\n").unwrap();
     std::fs::write(at("empty.spz"), "").unwrap();
-    let rows: [Row; 16] = [
+    let rows: [Row; 21] = [
         ("run cut --context 0,2", "view2.png"),
         ("check cut --context 0,2", "view2.png"),
         ("info poseless", "cameras.json"),
@@ -114,7 +114,19 @@ fn broken_files() {
         ("check scene --model nowhere.json", "nowhere.json"),
         ("check scene --images nowhere", "nowhere: expected a folder of pictures"),
         ("check scene/images --images scene", "--images: expected one scene with cameras"),
-        ("poses cut/images --strict", "got 1 that cannot: the first is broken.png (an empty file)"),
+        ("poses cut/images --strict", "got 1: the first is broken.png (an empty file)"),
+        // Before cameras are estimated.
+        (
+            "run cut/images --context view9,0",
+            "--context: expected a number below 3 or a photograph's name, got `view9`",
+        ),
+        ("run cut/images --target 3", "--target: expected a number below 3"),
+        ("run cut/images --weights scene.ply", "scene.ply"),
+        ("run scene/images -o scene/images", "scene/images: holds the photographs that are read"),
+        (
+            "run scene/images/view0.png scene/images/view1.png -o scene.ply/out",
+            "got a file (scene.ply)",
+        ),
         ("info unclosed", "cameras.json:"),
         ("render scene.ply", "scene.ply"),
         ("info scene.ply", "scene.ply"),

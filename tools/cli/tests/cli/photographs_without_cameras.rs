@@ -53,6 +53,23 @@ fn poses_of_two_photographs_are_those_of_the_scene() {
     }
 }
 
+/// Cameras that are written elsewhere name files that other programs can open, and photographs by their own names.
+#[test]
+fn poses_beside_the_photographs_name_their_files() {
+    let place = folder();
+    let arguments = format!("poses photos --intrinsics {INTRINSICS} -o poses");
+    assert_eq!(call_in(place.path(), &arguments).code, 0);
+    let text = fs::read_to_string(place.path().join("poses/cameras.json")).unwrap();
+    let json: serde_json::Value = serde_json::from_str(&text).unwrap();
+    for frame in json["frames"].as_array().unwrap() {
+        let file = frame["file"].as_str().unwrap();
+        assert!(fs::File::open(place.path().join("poses").join(file)).is_ok(), "{file}");
+        assert!(file.ends_with(".png"), "{file}");
+    }
+    let called = call_in(place.path(), "--json check poses --context input_0,input_1 -o out");
+    assert_eq!(called.code, 0, "{}", called.stderr);
+}
+
 #[test]
 fn a_folder_of_photographs_becomes_a_scene() {
     let place = folder();

@@ -116,7 +116,9 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
 
 fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     ensure!(args.cameras.is_none(), "--cameras: only with a finished scene");
-    let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
+    let wanted = [("--context", args.source.context.as_slice())];
+    let pair::Loaded { scene, .. } =
+        progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, &wanted, bar))?;
     scene.warnings.iter().for_each(print_warning);
     let first = args.input.first().context("no input")?;
     let (context, reason) = run::context(&args.source, first, &scene)?;

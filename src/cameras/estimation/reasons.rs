@@ -1,0 +1,130 @@
+//! Reasons against an estimate: those that weaken it, and those for which there is none.
+
+/// A weakness of an estimate.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum PoseWarning {
+    /// Too little is known of the focal length.
+    #[error("the focal length is uncertain by {percent:.0} %")]
+    UncertainFocal {
+        /// Standard deviation, percent.
+        percent: f64,
+    },
+    /// The focal length is a result of two photographs alone.
+    #[error(
+        "the focal length ({focal_px:.0} px) was estimated from two photographs, which often fails: \
+         give --fov or --intrinsics, or more photographs"
+    )]
+    FocalOfTwo {
+        /// The focal length, px of the first photograph.
+        focal_px: f64,
+    },
+    /// Another pose explains the matches nearly as well.
+    #[error("another position of the cameras explains {percent:.0} % of what this one explains")]
+    Rival {
+        /// Support of the other pose, percent of the support of this one.
+        percent: f64,
+    },
+    /// Few matches support the pose.
+    #[error("only {count} matched points support the cameras")]
+    FewPoints {
+        /// Number of matches.
+        count: usize,
+    },
+    /// The statistical error is large.
+    #[error("the direction between the cameras is uncertain by {degrees:.1} degrees")]
+    UncertainDirection {
+        /// Standard deviation, degrees.
+        degrees: f64,
+    },
+    /// An unknown focal length came out as that of a long lens.
+    #[error(
+        "the estimated angle of view is only {degrees:.0} degrees: pictures that hold two views side by side, or a \
+         part of a panorama, lead to such an estimate; give --fov if the lens is a long one"
+    )]
+    NarrowView {
+        /// Angle across the longer side, degrees.
+        degrees: f64,
+    },
+    /// Features stand still in the pictures. They were left out, so that the cameras are as certain as without them.
+    #[error(
+        "{percent:.0} % of the features stand still in the pictures while the camera moves (a logo, a frame, a part \
+         of what carries the camera); the cameras are estimated without them, and a folder `masks` leaves such \
+         pixels out of the scene"
+    )]
+    StandsStill {
+        /// Share of the features, percent.
+        percent: f64,
+    },
+    /// A refusal that [`Uncertain::Accept`](super::Uncertain::Accept) overrode.
+    #[error("{0}")]
+    Forced(PoseRefusal),
+}
+
+/// Reason for which photographs get no cameras.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum PoseRefusal {
+    /// Fewer than two photographs.
+    #[error("expected at least 2 photographs, got {count}")]
+    TooFew {
+        /// Number of photographs.
+        count: usize,
+    },
+    /// The photographs are equal.
+    #[error(
+        "the photographs show the same view: matched points move by {shift_px:.1} px at most; take \
+         the second photograph from a place a step aside"
+    )]
+    SameView {
+        /// Median shift of the matched points, px of a photograph of 640 px.
+        shift_px: f64,
+    },
+    /// The camera turned at one place.
+    #[error(
+        "the camera turned by {degrees:.0} degrees but did not move: points shift by \
+         {parallax_px:.1} px (of 640 px) beside the turn; take the second photograph from a place a \
+         step aside"
+    )]
+    PureRotation {
+        /// Angle of the rotation, degrees.
+        degrees: f64,
+        /// Median shift of the points beside the rotation, px of a photograph of 640 px.
+        parallax_px: f64,
+    },
+    /// Too few matches agree with one geometry.
+    #[error(
+        "only {consistent} of {matches} matched points agree with one position of the cameras \
+         ({needed} are needed): different places, a mirrored photograph, or too little in common; \
+         take photographs with more overlap and more texture"
+    )]
+    FewMatches {
+        /// Number of matches that agree.
+        consistent: usize,
+        /// Number of matches.
+        matches: usize,
+        /// Number that is needed.
+        needed: usize,
+    },
+    /// One of two photographs is mirrored.
+    #[error(
+        "one of the photographs is mirrored: {consistent} matched points agree with one position of \
+         the cameras once the second one is flipped left to right; flip one of them"
+    )]
+    Mirrored {
+        /// Number of matches that agree.
+        consistent: usize,
+    },
+    /// Several cameras explain the matches equally well.
+    #[error(
+        "two different positions of the cameras explain the matched points equally well ({percent:.0} \
+         %); take photographs of a scene that is less flat, or give --fov"
+    )]
+    Ambiguous {
+        /// Support of the second position, percent of the support of the first.
+        percent: f64,
+    },
+    /// No pair of photographs is wide enough to start with.
+    #[error("no two of the photographs have enough in common and enough distance")]
+    NoPair,
+}
