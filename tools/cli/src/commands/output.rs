@@ -12,7 +12,7 @@ use super::html::Page;
 use super::pair::folder_of;
 use super::video::{self, Video};
 use crate::report::{print_line, print_warning};
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, bail};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
