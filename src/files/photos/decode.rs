@@ -483,7 +483,7 @@ mod tests {
 
     /// A grey PNG of 1 bit, 16384 x 8192 (134 megapixels), white but for the left half of the upper half.
     fn large_png(path: &Path) {
-        let file = File::create(path).unwrap();
+        let file = std::fs::File::create(path).unwrap();
         let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), 16_384, 8192);
         encoder.set_depth(png::BitDepth::One);
         encoder.set_compression(png::Compression::Fastest);
