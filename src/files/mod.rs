@@ -93,16 +93,39 @@ impl Error {
 /// Reads a whole file.
 ///
 /// # Errors
-/// [`Error::Io`]: missing, unreadable, a directory.
+/// [`Error::Io`]: missing, unreadable, a directory, a pipe or device.
 pub fn read(path: impl AsRef<Path>) -> Result<Vec<u8>> {
     let path = path.as_ref();
-    std::fs::read(path).map_err(|e| Error::io(path, e))
+    check_regular(path).and_then(|()| std::fs::read(path)).map_err(|e| Error::io(path, e))
+}
+
+/// Opens a file for reading.
+///
+/// # Errors
+/// Missing, unreadable; those of [`check_regular`].
+fn open_regular(path: &Path) -> std::io::Result<File> {
+    check_regular(path)?;
+    File::open(path)
+}
+
+/// Refuses what is no file: the opening of a pipe waits for a writer, and a device need not end.
+///
+/// # Errors
+/// Missing; a pipe, a socket or a device. A folder is an error of the system when it is read.
+fn check_regular(path: &Path) -> std::io::Result<()> {
+    let kind = std::fs::metadata(path)?.file_type();
+    if kind.is_file() || kind.is_dir() {
+        return Ok(());
+    }
+    let got =
+        "expected a regular file, got a pipe, socket or device: save its content to a file first";
+    Err(std::io::Error::new(std::io::ErrorKind::InvalidInput, got))
 }
 
 /// The first `count` bytes of a file, or all of a shorter one.
 fn first_bytes(path: &Path, count: usize) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::with_capacity(count);
-    File::open(path)?.take(count as u64).read_to_end(&mut bytes)?;
+    open_regular(path)?.take(count as u64).read_to_end(&mut bytes)?;
     Ok(bytes)
 }
 

@@ -17,12 +17,16 @@ use subsplat::files::poses::scene::{
 };
 use subsplat_kernels::camera::Camera;
 
-fn write_text(folder: &Path, cameras: &[NamedCamera]) {
+pub(crate) fn write_text(folder: &Path, cameras: &[NamedCamera]) {
     let files = colmap_files::text(cameras);
     colmap_files::write(folder, "txt", [0, 1, 2].map(|i| files[i].as_bytes()));
 }
 
-fn write_transforms(path: &Path, cameras: &[NamedCamera], name: impl Fn(&str) -> String) {
+pub(crate) fn write_transforms(
+    path: &Path,
+    cameras: &[NamedCamera],
+    name: impl Fn(&str) -> String,
+) {
     let frames: Vec<_> = cameras
         .iter()
         .map(|c| {

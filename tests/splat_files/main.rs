@@ -7,3 +7,4 @@ mod properties;
 mod sog;
 mod splat_files;
 mod splat_fixtures;
+mod unusual;

@@ -12,13 +12,12 @@ use super::image::{LoadOptions, MAX_PIXELS, Probe, Truncated};
 use super::programs::Kind;
 use super::tiff_tags::{EXTRA_SAMPLES, is_tiff, numbers};
 use super::{converted, heic, icc, jpeg, jxl, ranges, raw, reduced};
-use crate::files::{Error, Result, read};
+use crate::files::{Error, Result, open_regular, read};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use std::borrow::Cow;
-use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
@@ -153,7 +152,7 @@ fn kind(bytes: &[u8], path: &Path) -> Result<Option<Kind>> {
 
 /// Reads size, orientation and EXIF of a file without decoding its pixels.
 pub(super) fn header(path: &Path) -> Result<Header> {
-    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let file = open_regular(path).map_err(|e| Error::io(path, e))?;
     let mut reader = BufReader::new(file);
     let start = reader.fill_buf().map_err(|e| Error::io(path, e))?;
     // The directory of a TIFF may lie anywhere, and holds its EXIF tags.
@@ -493,7 +492,7 @@ mod tests {
 
     /// A grey PNG of 1 bit, 16384 x 8192 (134 megapixels), white but for the left half of the upper half.
     fn large_png(path: &Path) {
-        let file = File::create(path).unwrap();
+        let file = std::fs::File::create(path).unwrap();
         let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), 16_384, 8192);
         encoder.set_depth(png::BitDepth::One);
         encoder.set_compression(png::Compression::Fastest);

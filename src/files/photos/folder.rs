@@ -3,7 +3,7 @@
 
 use super::photograph::probe_photograph;
 use super::video::is_video;
-use super::{heic, jxl, raw};
+use super::{heic, jxl, masks, raw};
 use crate::files::poses::assemble::{files, has_extension};
 use crate::files::{Error, first_bytes, lower_extension};
 use std::collections::{HashMap, HashSet};
@@ -57,6 +57,11 @@ impl FolderPhotographs {
         }
         notes
     }
+}
+
+/// Returns whether `folder` has the name of a folder of masks: `masks`, `mask`, `masks_2`.
+pub fn is_folder_of_masks(folder: impl AsRef<Path>) -> bool {
+    masks::is_folder_of_masks(folder.as_ref())
 }
 
 /// The photographs of a folder; without any, those of its folder `images`.

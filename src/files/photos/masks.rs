@@ -2,7 +2,7 @@
 //!
 //! A pose file names them (nerfstudio's `mask_path`), or they lie in a folder `masks` beside the folder of the
 //! photographs, `images` or a reduced copy as `images_4`, or in it: `masks/NAME.jpg.png` (COLMAP) or
-//! `masks/NAME.png`. A mask belongs to the stored pixels, as COLMAP and nerfstudio have it; one of the shape of
+//! `masks/NAME.png`. The folder may be called `mask` or `masks_2` too ([`FOLDERS`]). A mask belongs to the stored pixels, as COLMAP and nerfstudio have it; one of the shape of
 //! the upright pixels alone belongs to those. A JPEG has noise, so its values below 128 are masked.
 //!
 //! A mask in an alpha channel is read with its picture (`decode.rs`).
@@ -17,8 +17,10 @@ use image::metadata::Orientation;
 use image::{DynamicImage, GrayImage};
 use std::path::{Path, PathBuf};
 
-/// Name of a folder of masks.
-const FOLDER: &str = "masks";
+/// Names of a folder of masks. The first one that exists is read.
+const FOLDERS: [&str; 10] = [
+    "masks", "mask", "Masks", "Mask", "masks_2", "masks_4", "masks_8", "mask_2", "mask_4", "mask_8",
+];
 /// Largest relative difference of aspect between a mask and its photograph: reduced copies have sides rounded to whole
 /// pixels.
 const ASPECT: f64 = 0.02;
@@ -35,12 +37,11 @@ pub(in crate::files) fn of_photograph(image: &Path) -> Option<PathBuf> {
         name == "images" || name.starts_with("images_")
     };
     let images = own.ancestors().find(of_images);
-    let beside = images.and_then(|images| Some((images.parent()?.join(FOLDER), images, true)));
+    let beside = images.and_then(|images| Some((images.parent()?, images, true)));
     // A folder of masks among the photographs need not have all of them.
-    for (masks, images, whole) in beside.into_iter().chain([(own.join(FOLDER), own, false)]) {
-        if !masks.is_dir() {
-            continue;
-        }
+    for (folder, images, whole) in beside.into_iter().chain([(own, own, false)]) {
+        let mut masks = FOLDERS.iter().map(|name| folder.join(name));
+        let Some(masks) = masks.find(|masks| masks.is_dir()) else { continue };
         let name = absolute.strip_prefix(images).unwrap_or(&absolute);
         let named = masks.join(name.with_extension("png"));
         let found = if named.is_file() {
@@ -54,6 +55,12 @@ pub(in crate::files) fn of_photograph(image: &Path) -> Option<PathBuf> {
         }
     }
     None
+}
+
+/// Returns whether `folder` has the name of a folder of masks.
+pub(super) fn is_folder_of_masks(folder: &Path) -> bool {
+    let name = folder.file_name().unwrap_or_default();
+    FOLDERS.iter().any(|masks| name == *masks)
 }
 
 /// Checks that a mask can be used for a photograph.

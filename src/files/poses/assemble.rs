@@ -4,12 +4,13 @@
 use super::notes::Notes;
 use super::panoramas::{self, DraftView};
 use super::reading::{Folders, Reading};
+use super::rotations::{OrthonormalPose, of_one_world, orthonormal};
 use super::scene::{Frame, LeftOut, Pixels, Scene, SceneFormat, Units};
 use crate::files::photos::distortion::Distortion;
 use crate::files::photos::image::{Probe, probe};
 use crate::files::photos::masks;
 use crate::files::{Error, Result};
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat4, DVec3};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use subsplat_kernels::camera::{Camera, CameraError, Intrinsics};
@@ -215,42 +216,6 @@ pub(super) fn entries(folder: &Path) -> Vec<PathBuf> {
     paths.filter(|path| !hidden(path)).collect()
 }
 
-/// A pose after [`orthonormal`].
-pub(super) struct OrthonormalPose {
-    /// The corrected pose.
-    pub pose: DMat4,
-    /// Largest entry of |RᵀR − I| before the correction.
-    pub error: f64,
-}
-
-/// Replaces the rotation by the nearest orthonormal one, to undo rounding in the file. The
-/// pose stays as it is where [`Camera::new`] would refuse it, and where the error is below
-/// the precision of f32.
-pub(super) fn orthonormal(pose: DMat4) -> OrthonormalPose {
-    let error = |r: DMat3| {
-        let gram = r.transpose() * r - DMat3::IDENTITY;
-        gram.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()))
-    };
-    let mut rotation = DMat3::from_mat4(pose);
-    let error = error(rotation);
-    if !(2e-6..=f64::from(Camera::RIGID_TOLERANCE)).contains(&error) {
-        return OrthonormalPose { pose, error };
-    }
-    // Newton's iteration for the polar decomposition converges quadratically; the start is
-    // within 1 %.
-    for _ in 0..6 {
-        rotation = (rotation + rotation.inverse().transpose()) * 0.5;
-    }
-    let column = |v: glam::DVec3| v.extend(0.0);
-    let pose = DMat4::from_cols(
-        column(rotation.x_axis),
-        column(rotation.y_axis),
-        column(rotation.z_axis),
-        pose.w_axis,
-    );
-    OrthonormalPose { pose, error }
-}
-
 /// Intrinsics in pixels of a picture on disk.
 struct StoredIntrinsics {
     intrinsics: Intrinsics,
@@ -328,6 +293,8 @@ pub(super) fn assemble(
     if drafts.is_empty() {
         return Err(Error::format(path, "at least one frame", "none"));
     }
+    reading.settle(&mut drafts);
+    let scaled = if source.has_file() { of_one_world(path, &mut drafts)? } else { None };
     let origin = origin_of(&drafts);
     drafts.iter_mut().for_each(|d| d.world_from_camera.w_axis -= origin.extend(0.0));
     let probe = |d: &Draft| match (&d.image, pictures, d.size) {
@@ -384,14 +351,15 @@ pub(super) fn assemble(
     }
     if frames.is_empty() {
         let first = notes.missing.first().cloned().unwrap_or_default();
-        let got = format!("none of {count} (the first is `{first}`)");
-        let expected = match pictures {
-            Pictures::Needed => "pictures on disk",
-            Pictures::Unread => "cameras with the size of their pictures",
+        let (expected, searched) = match pictures {
+            Pictures::Needed => ("pictures on disk", reading.searched()),
+            Pictures::Unread => ("cameras with the size of their pictures", String::new()),
         };
+        let got = format!("none of {count} (the first is `{first}`){searched}");
         return Err(Error::format(path, expected, got));
     }
     let mut warnings = notes.lines(count);
+    warnings.extend(scaled);
     if origin != DVec3::ZERO {
         let [x, y, z] = origin.to_array();
         warnings.push(format!(
@@ -409,6 +377,7 @@ pub(super) fn assemble(
         origin,
         warnings,
         left_out: notes.left_out,
+        other_sources: Vec::new(),
     })
 }
 

@@ -18,9 +18,10 @@
 //! The list of 3DGS has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (of the camera): the same axes, principal point in the middle.
 
-use super::assemble::{Draft, Lens, assemble, camera_error, origin_of, orthonormal};
+use super::assemble::{Draft, Lens, assemble, camera_error, origin_of};
 use super::json;
 use super::reading::Reading;
+use super::rotations::orthonormal;
 use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
 use crate::files::{Error, Result, read, write_atomic};
 use glam::{DMat4, DVec3, DVec4, Vec3};

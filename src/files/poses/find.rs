@@ -1,6 +1,7 @@
 //! The scene of a folder: every pose file in it, or one level below, by content. The first kind of this
 //! list that a folder has is read, of several COLMAP models the largest. A line names the others of the same
-//! kind, and those of another kind with more cameras.
+//! kind, and those of another kind with more cameras. A file that cannot be read, or none of whose pictures is
+//! found, gives a line, and the next one is read (`load.rs`).
 //!
 //! 1. `cameras.json`, `transforms.json`, `transforms_train.json` (NeRF's synthetic scenes)
 //! 2. COLMAP models in `sparse`, `colmap/sparse`, the folder itself and `dense`, and in their numbered folders
@@ -59,6 +60,8 @@ pub(super) enum PoseFile {
     Json(PathBuf),
     /// Folder of a COLMAP model.
     Colmap(PathBuf),
+    /// `images.txt` of a COLMAP model beside a binary one.
+    ColmapText(PathBuf),
     /// File of RealEstate10K.
     Re10k(PathBuf),
     /// Folder of `poses.txt`.
@@ -87,6 +90,7 @@ impl PoseFile {
         match self {
             Self::Json(path) => cameras_of_json(path, true).unwrap_or(0),
             Self::Colmap(folder) => colmap::count_images(folder),
+            Self::ColmapText(path) => colmap::count_images_txt(path),
             Self::Re10k(_) | Self::Matrices(_) => 0,
             Self::OpenSfm(path) => value_of(path).map_or(0, |value| opensfm::count(&value)),
             Self::Polycam(folder) => polycam::count(folder),
@@ -101,14 +105,15 @@ impl PoseFile {
         }
     }
 
-    fn path(&self) -> &Path {
+    /// The file, or the folder of several.
+    pub fn path(&self) -> &Path {
         match self {
             Self::Json(path) | Self::Colmap(path) | Self::Re10k(path) | Self::Matrices(path) => {
                 path
             }
             Self::OpenSfm(path) | Self::Polycam(path) | Self::Record3d(path) => path,
             Self::Bundler(path) | Self::Llff(path) | Self::Nerfstudio(path) => path,
-            Self::Metashape(path) | Self::RealityCapture(path) => path,
+            Self::Metashape(path) | Self::RealityCapture(path) | Self::ColmapText(path) => path,
         }
     }
 }
@@ -134,8 +139,19 @@ enum Part {
 /// The pose file of a folder that is read, and lines about what else is there.
 #[derive(Clone, Debug)]
 pub(super) struct Found {
-    pub file: PoseFile,
+    pub file: Source,
     pub notes: Vec<String>,
+    /// One of the lines names others with cameras of their own.
+    pub names_others: bool,
+    /// The others in the order of preference.
+    pub others: Vec<Source>,
+}
+
+/// A pose file with its path below the scene's folder.
+#[derive(Clone, Debug)]
+pub(super) struct Source {
+    pub file: PoseFile,
+    pub name: String,
 }
 
 /// The scene of `folder`, or of the folders below it where `folder` has neither cameras nor photographs.
@@ -159,8 +175,8 @@ pub(super) fn find(folder: &Path) -> Result<Option<Found>> {
     }
     let mut below = below.into_iter();
     let Some(first) = below.next() else { return Ok(None) };
-    let mut found = chosen(folder, first, below.collect());
-    let read = name(folder, found.file.path());
+    let mut found = chosen(folder, first, below.collect(), |_| true);
+    let read = &found.file.name;
     found.notes.insert(0, format!("the scene is read from {read}, below the folder"));
     Ok(Some(found))
 }
@@ -175,10 +191,10 @@ pub(super) fn find_in(folder: &Path) -> Result<Option<Found>> {
     // Another format usually has the same cameras.
     let others: Vec<Candidate> = own.collect();
     let count = if others.is_empty() { 0 } else { first.file.cameras() };
+    let part = first.part;
     let worth_a_line =
-        |other: &Candidate| other.part == first.part || (count > 0 && other.file.cameras() > count);
-    let others = others.into_iter().filter(worth_a_line).collect();
-    Ok(Some(chosen(folder, first, others)))
+        |other: &Candidate| other.part == part || (count > 0 && other.file.cameras() > count);
+    Ok(Some(chosen(folder, first, others, worth_a_line)))
 }
 
 /// A line about cameras in `folder` in a layout that is not read.
@@ -246,6 +262,8 @@ fn candidates(folder: &Path) -> Result<Vec<Candidate>> {
     if models.len() > 1 {
         models.sort_by_cached_key(|model| std::cmp::Reverse(colmap::count_images(model)));
     }
+    let texts: Vec<PathBuf> =
+        models.iter().filter_map(|model| colmap::second_text(model)).collect();
     models.into_iter().for_each(|model| add(PoseFile::Colmap(model), Part::Colmap));
     if let Some(path) = re10k::find(folder)? {
         add(PoseFile::Re10k(path), Part::Whole("txt"));
@@ -254,6 +272,7 @@ fn candidates(folder: &Path) -> Result<Vec<Candidate>> {
         add(PoseFile::Matrices(folder.to_owned()), Part::Whole("poses.txt"));
     }
     foreign(folder).into_iter().for_each(|(file, name)| add(file, Part::Whole(name)));
+    texts.into_iter().for_each(|path| add(PoseFile::ColmapText(path), Part::Whole("images.txt")));
     if all.is_empty() {
         let file = any_json(folder).map(|file| Candidate { file, part: Part::Whole("json") });
         all.extend(file);
@@ -388,24 +407,33 @@ fn cameras_of_json(path: &Path, lists: bool) -> Option<usize> {
     frames.or(value.as_array().filter(|_| lists)).map(Vec::len)
 }
 
-/// The candidate `first`, and a line that names the `others`.
-fn chosen(folder: &Path, first: Candidate, others: Vec<Candidate>) -> Found {
-    let named = |other: Candidate| {
+/// The candidate `first` and the `others`, with a line that names those of them that are worth one.
+fn chosen(
+    folder: &Path,
+    first: Candidate,
+    others: Vec<Candidate>,
+    worth_a_line: impl Fn(&Candidate) -> bool,
+) -> Found {
+    let named = |other: &Candidate| {
         let name = name(folder, other.file.path());
         match other.file.cameras() {
             0 => name,
             cameras => format!("{name} ({cameras} cameras)"),
         }
     };
-    let others: Vec<String> = others.into_iter().map(named).collect();
-    let file = first.file;
-    let notes = if others.is_empty() {
+    let source = |candidate: Candidate| {
+        let file = candidate.file;
+        Source { name: name(folder, file.path()), file }
+    };
+    let lines: Vec<String> = others.iter().filter(|other| worth_a_line(other)).map(named).collect();
+    let file = source(first);
+    let names_others = !lines.is_empty();
+    let notes = if lines.is_empty() {
         Vec::new()
     } else {
-        let read = name(folder, file.path());
-        vec![format!("cameras come from {read}; not read: {}", others.join(", "))]
+        vec![format!("cameras come from {}; not read: {}", file.name, lines.join(", "))]
     };
-    Found { file, notes }
+    Found { file, notes, names_others, others: others.into_iter().map(source).collect() }
 }
 
 /// `path` as seen from `folder`.

@@ -377,7 +377,7 @@ fn draft(
 ) -> Result<Draft> {
     let PlacedCamera { sensor, world_from_camera } = placed?;
     let place = format!(" camera {name}");
-    let image = if several { reading.find(roots, name) } else { reading.find_by_end(roots, name) };
+    let image = if several { reading.find_exact(roots, name) } else { reading.find(roots, name) };
     if several && (image.is_none() || !name.contains(['/', '\\'])) {
         let expected =
             "a label that one camera has, or its picture in a folder of its group's name";

@@ -67,7 +67,8 @@ pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
             let name = pose.file_path.clone();
             of_list(path, i, pose, reading).unwrap_or_else(|e| Draft::refused(name, e))
         });
-        return assemble(path, SceneFormat::Nerfstudio, &reading.needed(), drafts.collect());
+        let drafts: Vec<Draft> = drafts.collect();
+        return assemble(path, SceneFormat::Nerfstudio, &reading.needed(), drafts);
     }
     let file: CameraPath = json::parse(path, &bytes, "a camera path of nerfstudio's viewer")?;
     // get_path_from_json takes every other word for a perspective.

@@ -1,7 +1,8 @@
 //! Panoramas of pose files: a picture with [`Distortion::Equirectangular`] becomes several frames, pinhole views
 //! in directions that all panoramas of the scene share ([`crate::files::photos::views`]).
 
-use super::assemble::{Draft, Lens, orthonormal};
+use super::assemble::{Draft, Lens};
+use super::rotations::orthonormal;
 use crate::files::photos::distortion::Distortion;
 use crate::files::photos::image::Probe;
 use crate::files::photos::views::{Cut, has_panorama_shape, panorama_cut, shared_axes, view_label};

@@ -51,7 +51,7 @@ pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let drafts = cameras_in(&cameras).into_iter().map(|file| {
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         match draft(&file, &name, reading) {
-            Ok(draft) => Draft { image: reading.find(&[pictures.as_path()], &name), ..draft },
+            Ok(draft) => Draft { image: reading.find_exact(&[pictures.as_path()], &name), ..draft },
             Err(error) => Draft::refused(name, error),
         }
     });

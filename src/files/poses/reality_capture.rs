@@ -177,7 +177,7 @@ pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
         let lens = Lens::LargerSide([camera.focal / FILM, x, y]);
         let pose = camera.world_from_camera();
         Draft {
-            image: reading.find_by_end(&roots, &name),
+            image: reading.find(&roots, &name),
             distortion: camera.distortion,
             ..Draft::new(format!(":{line}"), name, lens, pose)
         }

@@ -1,8 +1,8 @@
-//! Posed photographs: one type for every pose format, and the detection of formats.
+//! Posed photographs: one type for every pose format.
 //!
 //! A [`Scene`] has OpenCV cameras (`world_from_camera`) and intrinsics in pixels of the
 //! stored picture, pixel centres at +0.5 (`camera.rs`), in every format. The precedence of
-//! pose files in a folder is that of the module [`super::find`]. The path of a pose file selects that file, as
+//! pose files in a folder is that of the module [`super::find`] (`load.rs` reads them). The path of a pose file selects that file, as
 //! does [`SceneOptions::model`].
 //!
 //! Pose files refer to the stored pixels ([`Pixels::Stored`]): EXIF orientation is not applied,
@@ -10,21 +10,18 @@
 //! the upright pixels ([`Pixels::Upright`]).
 
 use super::assemble::{self, Draft, Lens, Pictures, assemble};
-use super::find::{Found, PoseFile, find, find_in, not_read};
+use super::find::{find, find_in};
+use super::load::load_at;
 #[cfg(feature = "network")]
 use super::panoramas::DraftView;
 use super::reading::{Reading, SceneOptions};
-use super::{
-    bundler, cameras_json, colmap, find, llff, matrices, metashape, nerfstudio, opensfm, polycam,
-    re10k, reality_capture, record3d, transforms,
-};
 use crate::files::photos::distortion::Distortion;
 use crate::files::photos::image::{LoadOptions, LoadedPicture, load_with, probe};
 use crate::files::photos::masks;
 use crate::files::photos::photograph::{Photograph, load_photograph, load_photograph_or_panorama};
 use crate::files::photos::undistort::{pinhole, undistort, undistort_masked};
 use crate::files::photos::views::Cut;
-use crate::files::{Error, Result, lower_extension};
+use crate::files::{Error, Result};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::{DVec3, Vec3};
@@ -276,6 +273,9 @@ pub struct Scene {
     /// Entries of the pose file that cannot be loaded. They have no frame, but for those of another shape than
     /// their picture's ([`Frame::other_shape`]).
     pub left_out: Vec<LeftOut>,
+    /// Other sources of cameras in the scene's folder that can be read, as paths below it for
+    /// [`SceneOptions::model`]. Empty where [`SceneOptions::model`] or a path named the source.
+    pub other_sources: Vec<String>,
 }
 
 impl Scene {
@@ -451,63 +451,6 @@ pub fn load_cameras_with(path: impl AsRef<Path>, options: &SceneOptions) -> Resu
     load_at(path.as_ref(), Pictures::Unread, options)
 }
 
-fn load_at(path: &Path, pictures: Pictures, options: &SceneOptions) -> Result<Scene> {
-    let metadata = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
-    if let Some(images) = options.images.as_deref().filter(|images| !images.is_dir()) {
-        return Err(Error::format(images, "a folder of pictures", "no folder"));
-    }
-    let folder = if metadata.is_dir() { path } else { path.parent().unwrap_or(Path::new("")) };
-    let reading = Reading::with(pictures, options, options.model.as_ref().map(|_| folder));
-    if let Some(model) = &options.model {
-        let inside = folder.join(model);
-        let model = if inside.exists() { inside } else { model.clone() };
-        return load_model(&model, &reading);
-    }
-    if metadata.is_file() {
-        return load_file(path, &reading);
-    }
-    let Some(Found { file, notes }) = find(path)? else {
-        let got = not_read(path).unwrap_or_else(|| "a folder with none of them".to_owned());
-        return Err(Error::format(path, SCENES, got));
-    };
-    let mut scene = load_found(&file, &reading)?;
-    scene.warnings.extend(notes);
-    Ok(scene)
-}
-
-/// For messages: the pose files of a folder.
-pub(super) const SCENES: &str = "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, poses.txt with K.txt, or \
-     the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML) or RealityCapture (CSV)";
-
-/// Reads the pose file or the folder of one that [`SceneOptions::model`] names.
-fn load_model(model: &Path, reading: &Reading<'_>) -> Result<Scene> {
-    let metadata = std::fs::metadata(model).map_err(|e| Error::io(model, e))?;
-    if metadata.is_file() {
-        return load_file(model, reading);
-    }
-    match find(model)? {
-        Some(Found { file, .. }) => load_found(&file, reading),
-        None => Err(Error::format(model, SCENES, "a folder with none of them")),
-    }
-}
-
-fn load_found(file: &PoseFile, reading: &Reading<'_>) -> Result<Scene> {
-    match file {
-        PoseFile::Json(file) => load_json(file, reading),
-        PoseFile::Colmap(folder) => colmap::load(folder, reading),
-        PoseFile::Re10k(file) => re10k::load(file, reading),
-        PoseFile::Matrices(folder) => matrices::load_with(folder, reading),
-        PoseFile::OpenSfm(file) => opensfm::load(file, reading),
-        PoseFile::Polycam(folder) => polycam::load(folder, reading),
-        PoseFile::Record3d(file) => record3d::load(file, reading),
-        PoseFile::Bundler(file) => bundler::load(file, reading),
-        PoseFile::Llff(file) => llff::load(file, reading),
-        PoseFile::Metashape(file) => metashape::load(file, reading),
-        PoseFile::RealityCapture(file) => reality_capture::load(file, reading),
-        PoseFile::Nerfstudio(file) => nerfstudio::load(file, reading),
-    }
-}
-
 /// Reports whether `path` is a folder with a pose file that [`load_scene`] reads.
 pub fn is_scene(path: impl AsRef<Path>) -> bool {
     find_in(path.as_ref()).is_ok_and(|found| found.is_some())
@@ -517,38 +460,4 @@ pub fn is_scene(path: impl AsRef<Path>) -> bool {
 /// folder below it.
 pub fn has_scene(path: impl AsRef<Path>) -> bool {
     find(path.as_ref()).is_ok_and(|found| found.is_some())
-}
-
-fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-    let folder = path.parent().unwrap_or(Path::new(""));
-    let extension = lower_extension(path);
-    match (name.as_str(), extension.as_str()) {
-        (_, "json") | ("metadata", "") => match find::foreign_json(path) {
-            Some(file) => load_found(&file, reading),
-            None => load_json(path, reading),
-        },
-        (_, "npy") => llff::load(path, reading),
-        (_, "out") => bundler::load(path, reading),
-        (_, "xml") => metashape::load(path, reading),
-        (_, "csv") => reality_capture::load(path, reading),
-        ("cameras.txt" | "images.txt" | "points3d.txt", _) | (_, "bin") => {
-            colmap::load(folder, reading)
-        }
-        ("poses.txt" | "k.txt", _) => matrices::load_with(folder, reading),
-        (_, "txt") => re10k::load(path, reading),
-        _ => Err(Error::format(
-            path,
-            "a folder or a pose file (.json, .txt, .bin, .npy, .out, .xml, .csv)",
-            format!("a file with extension `{extension}`"),
-        )),
-    }
-}
-
-/// Reads `cameras.json`, `transforms.json`, or a file of one of their layouts.
-fn load_json(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
-    if cameras_json::is_cameras_json(path)? {
-        return cameras_json::load(path, reading);
-    }
-    transforms::load(path, reading)
 }

@@ -62,6 +62,8 @@ struct AxisRotation {
 pub(super) struct Outgoing<'a> {
     splats: &'a Splats,
     min_opacity: f32,
+    /// Largest coordinate that the format holds.
+    reach: f64,
     rotation: Option<AxisRotation>,
     map: Option<ShMap>,
     /// Degree written.
@@ -70,6 +72,8 @@ pub(super) struct Outgoing<'a> {
     pub count: usize,
     /// Gaussians under the least opacity.
     pub pruned: usize,
+    /// Gaussians of enough opacity with a coordinate beyond the format's range, which are left out.
+    pub out_of_range: usize,
     /// Gaussians of which a σ was raised to [`SCALE_MIN`].
     pub clamped_scales: usize,
     /// Smallest and largest mean, axes of the file.
@@ -77,13 +81,17 @@ pub(super) struct Outgoing<'a> {
 }
 
 impl<'a> Outgoing<'a> {
-    /// Checks every number of `splats` and counts the Gaussians that will be written.
-    /// `rotation` maps the world's axes to the file's; `path` is for errors.
+    /// Checks every number of `splats` and counts the Gaussians that will be written: those of enough opacity
+    /// whose coordinates are at most `reach`. `rotation` maps the world's axes to the file's; `path` is for errors.
+    ///
+    /// # Errors
+    /// A number that is not finite, an opacity out of [0, 1], no Gaussian to write, more than half beyond `reach`.
     pub fn new(
         splats: &'a Splats,
         options: &SaveOptions,
         rotation: Option<DMat3>,
         degree_limit: usize,
+        reach: f64,
         path: &Path,
     ) -> Result<Self> {
         let wanted = options.sh_degree.unwrap_or(3);
@@ -99,15 +107,22 @@ impl<'a> Outgoing<'a> {
         let mut out = Self {
             splats,
             min_opacity,
+            reach,
             rotation,
             map,
             sh_degree,
             count: 0,
             pruned: 0,
+            out_of_range: 0,
             clamped_scales: 0,
             bounds: [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]],
         };
         out.survey(path)?;
+        if out.out_of_range > out.count {
+            let all = out.count + out.out_of_range;
+            let got = format!("{} of {all} beyond that", out.out_of_range);
+            return Err(Error::format(path, format!("coordinates within {reach} units"), got));
+        }
         if out.count == 0 {
             let got = format!("none (of {}, least opacity {min_opacity})", splats.len());
             return Err(Error::format(path, "at least one Gaussian to write", got));
@@ -126,7 +141,8 @@ impl<'a> Outgoing<'a> {
                 );
             }
             if !self.keeps(i) {
-                self.pruned += 1;
+                let opaque = self.is_opaque(i);
+                *if opaque { &mut self.out_of_range } else { &mut self.pruned } += 1;
                 continue;
             }
             self.count += 1;
@@ -162,6 +178,11 @@ impl<'a> Outgoing<'a> {
     }
 
     fn keeps(&self, i: usize) -> bool {
+        let mean = self.splats.mean(i);
+        self.is_opaque(i) && mean.into_iter().all(|v| f64::from(v.abs()) <= self.reach)
+    }
+
+    fn is_opaque(&self, i: usize) -> bool {
         // Rounding may leave an opacity slightly below zero.
         self.splats.opacity(i).max(0.0) >= self.min_opacity
     }

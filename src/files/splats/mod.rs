@@ -18,6 +18,7 @@
 //! What a reader applies, leaves out or does not read, it says in a note ([`SplatFile::notes`]).
 
 pub mod compressed_ply;
+mod far;
 mod gaussians;
 pub mod glb;
 mod glb_read;
@@ -29,14 +30,13 @@ pub mod sog;
 pub mod splat;
 pub mod spz;
 
-use crate::files::{Error, Result, first_bytes, read, write_atomic};
+use crate::files::{Error, Result, first_bytes, open_regular, read, write_atomic};
 use crate::scene::splats::Splats;
 use gaussians::{Decoded, HALF_TURN_X, Outgoing};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use spz::SpzVersion;
-use std::fs::File;
-use std::io::{BufReader, Cursor, Read, Seek, Write};
+use std::io::{BufReader, Cursor, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use subsplat_kernels::layout::ALPHA_MIN;
@@ -58,6 +58,9 @@ pub enum SplatFormat {
     /// mkkellogg's `.ksplat`.
     Ksplat,
 }
+
+/// Bytes from the start of a file that decide what it is.
+const HEAD: usize = 64;
 
 /// The formats of [`load_splats`], for errors.
 const KNOWN: &str = "a .ply, .glb, .spz, .sog, .splat or .ksplat file";
@@ -157,6 +160,8 @@ pub struct SaveReport {
     pub count: usize,
     /// Gaussians below the least opacity.
     pub pruned: usize,
+    /// Gaussians with a coordinate beyond the format's range, which are left out.
+    pub out_of_range: usize,
     /// SH degree written.
     pub sh_degree: usize,
     /// SH degree of the splats.
@@ -167,12 +172,28 @@ pub struct SaveReport {
     pub bytes: u64,
 }
 
+impl SaveReport {
+    /// Lines for a person about Gaussians that the file does not have.
+    pub fn notes(&self) -> Vec<String> {
+        let all = self.count + self.out_of_range;
+        let line = || {
+            format!(
+                "left out: {} of {all} splats, whose coordinates are beyond the range of the format \
+                 (2^23 units from the origin)",
+                self.out_of_range
+            )
+        };
+        (self.out_of_range > 0).then(line).into_iter().collect()
+    }
+}
+
 /// Content of a splat file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SplatFile {
     /// The Gaussians: standard SH basis, K = 1, unit world quaternions, no gain.
     pub splats: Splats,
-    /// Comments of the file ([`SaveOptions::comments`]).
+    /// Comments of the file ([`SaveOptions::comments`]), with that of the origin where the reader has moved splats
+    /// far from it ([`comment_of_origin`](crate::scene::render::comment_of_origin)).
     pub comments: Vec<String>,
     /// Lines for a person, without the file's name: Gaussians that were left out with their number
     /// and the reason, properties that were applied (`filter_3D`) or not read.
@@ -233,32 +254,42 @@ fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
         return Ok((SplatFormat::Sog, decoded, bytes));
     }
     let io = |e| Error::io(path, e);
-    let mut file = File::open(path).map_err(io)?;
-    let metadata = file.metadata().map_err(io)?;
-    let mut head = Vec::new();
-    Read::take(&mut file, 4).read_to_end(&mut head).map_err(io)?;
+    let head = first_bytes(path, HEAD).map_err(io)?;
     let format = format_of(&head, path)?;
-    // The largest files are .ply: they are streamed, where the size is known.
-    if format == SplatFormat::Ply && metadata.is_file() {
-        let mut reader = BufReader::with_capacity(1 << 16, File::open(path).map_err(io)?);
-        let decoded = ply::decode(&mut reader, metadata.len(), path)?;
-        return Ok((format, decoded, metadata.len()));
+    // The largest files are .ply: they are streamed.
+    if format == SplatFormat::Ply {
+        let file = open_regular(path).map_err(io)?;
+        let length = file.metadata().map_err(io)?.len();
+        let mut reader = BufReader::with_capacity(1 << 16, file);
+        let decoded = ply::decode(&mut reader, length, path)?;
+        return Ok((format, decoded, length));
     }
-    let mut bytes = head;
-    if metadata.is_file() {
-        bytes = read(path)?;
-    } else {
-        file.read_to_end(&mut bytes).map_err(io)?;
-    }
+    let bytes = read(path)?;
     Ok((format, decode_bytes(format, &bytes, path)?, bytes.len() as u64))
 }
 
 /// Detects the format of a file by its first bytes, else by its name.
 fn format_of(head: &[u8], path: &Path) -> Result<SplatFormat> {
+    if let Some(other) = not_the_file(head) {
+        return Err(Error::format(path, KNOWN, other));
+    }
     let head = &head[..head.len().min(4)];
     SplatFormat::from_magic(head)
         .or_else(|| SplatFormat::from_name(path))
         .ok_or_else(|| Error::format(path, KNOWN, format!("first bytes {head:02x?}")))
+}
+
+/// Names what a download gives in place of a file.
+fn not_the_file(head: &[u8]) -> Option<&'static str> {
+    let start = String::from_utf8_lossy(&head[..head.len().min(HEAD)]).to_lowercase();
+    let start = start.trim_start_matches(|c: char| c.is_whitespace() || c == '\u{feff}');
+    if start.starts_with("<!doctype html") || start.starts_with("<html") {
+        return Some(
+            "a web page (HTML): download the scene's file itself, not the page that shows it",
+        );
+    }
+    let pointer = start.starts_with("version https://git-lfs");
+    pointer.then_some("a pointer of git-lfs in place of the file: fetch the file by `git lfs pull`")
 }
 
 fn decode_bytes(format: SplatFormat, bytes: &[u8], path: &Path) -> Result<Decoded> {
@@ -309,7 +340,8 @@ impl Splats {
 ///
 /// # Errors
 /// An extension of no writable format, numbers that are not finite (the first Gaussian is
-/// named), an opacity out of [0, 1], no Gaussian left to write, system errors.
+/// named), an opacity out of [0, 1], no Gaussian left to write, a `.spz` of splats of which more than half have
+/// coordinates beyond 2²³ units, system errors.
 pub fn save_splats(
     path: impl AsRef<Path>,
     splats: &Splats,
@@ -390,7 +422,11 @@ impl<'a> Plan<'a> {
         options: &SaveOptions,
         path: &Path,
     ) -> Result<Self> {
-        let survey = |rotation, limit| Outgoing::new(splats, options, rotation, limit, path);
+        let reach = match format {
+            SplatFormat::Spz => spz::FIXED_MAX,
+            _ => f64::INFINITY,
+        };
+        let survey = |rotation, limit| Outgoing::new(splats, options, rotation, limit, reach, path);
         let rotation = options.up.rotation();
         let out = match format {
             SplatFormat::Ply => survey(rotation, 4)?,
@@ -433,6 +469,7 @@ impl<'a> Plan<'a> {
             format: self.format,
             count: self.out.count,
             pruned: self.out.pruned,
+            out_of_range: self.out.out_of_range,
             sh_degree: self.out.sh_degree,
             stored_sh_degree: splats.sh_degree,
             clamped_scales: self.out.clamped_scales,

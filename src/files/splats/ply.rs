@@ -20,13 +20,16 @@
 //!   z`, `opacity`, `scale_*` and `rot_*` are 16-bit integers, they are the bits of halves. Its files
 //!   with codebooks are refused.
 //!
+//! Positions of doubles or text far from the origin become relative to their middle (`far.rs`).
+//!
 //! `compressed_ply.rs` reads PlayCanvas' packed files.
 
 use super::gaussians::{Decoded, Incoming, Outgoing, dc_from_colour, logit, sigmoid};
-use super::ply_container::{Element, Header, Scalar, Source};
-use super::{SaveOptions, Up, compressed_ply};
+use super::ply_container::{Element, Encoding, Header, Scalar, Source};
+use super::{SaveOptions, Up, compressed_ply, far};
 use crate::files::{Error, Result};
 use crate::scene::splats::Splats;
+use glam::DVec3;
 use half::f16;
 use std::io::{BufRead, Write};
 use std::path::Path;
@@ -68,6 +71,9 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
     }
     let parts = vertex_elements(&header, path)?;
     let (mut incoming, mut notes) = (None, Vec::new());
+    let is_exact = header.encoding == Encoding::Ascii
+        || parts.iter().any(|&i| has_double_positions(&header.elements[i]));
+    let mut places = is_exact.then(Vec::new);
     for (i, element) in header.elements.iter().enumerate() {
         if !parts.contains(&i) {
             header.rows(element, &mut source, |_, _| Ok(()))?;
@@ -76,7 +82,7 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
         let layout = Layout::of(element, path)?;
         let count = header.checked_count(element, &source)?;
         let incoming = incoming.get_or_insert_with(|| Incoming::with_capacity(count, 0));
-        read_vertices(&header, element, &layout, &mut source, incoming)?;
+        read_vertices(&header, element, &layout, &mut source, incoming, places.as_mut())?;
         for note in layout.notes(element) {
             if !notes.contains(&note) {
                 notes.push(note);
@@ -85,9 +91,20 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
     }
     notes.extend(source.finish(header.encoding)?);
     let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
-    let splats = incoming.into_splats(path)?;
+    let mut splats = incoming.into_splats(path)?;
+    let mut comments = header.comments;
+    notes.extend(match places {
+        Some(places) => far::move_to_origin(&mut splats, &places, &mut comments),
+        None => far::note_of_lost_digits(&splats),
+    });
     let flavour = format!("ply {}", header.encoding.name());
-    Decoded::new(splats, flavour, header.comments, notes, path)
+    Decoded::new(splats, flavour, comments, notes, path)
+}
+
+/// Returns whether an element has positions of 64 bits.
+fn has_double_positions(element: &Element) -> bool {
+    let position = |name: &&str| element.position(name).map(|i| element.properties[i].kind);
+    ["x", "y", "z"].iter().filter_map(position).any(|kind| kind == Scalar::F64)
 }
 
 /// Returns the indices of the elements with Gaussians: the first `vertex`, else all of `vertex_0`,
@@ -272,13 +289,14 @@ impl Layout {
     }
 }
 
-/// Reads the rows of `element` into `incoming`.
+/// Reads the rows of `element` into `incoming`, and the positions with all their digits into `places`.
 fn read_vertices(
     header: &Header,
     element: &Element,
     layout: &Layout,
     source: &mut Source,
     incoming: &mut Incoming,
+    mut places: Option<&mut Vec<DVec3>>,
 ) -> Result<()> {
     let mut rest = vec![0.0f32; layout.rest.len()];
     header.rows(element, source, |_, row| {
@@ -291,6 +309,9 @@ fn read_vertices(
         let [a, b] = layout.scale.map(|i| v(i).exp());
         let c = layout.thickness.map_or_else(|| DISC.min(a).min(b), |i| v(i).exp());
         let (scale, factor) = filtered([a, b, c], layout.filter.map_or(0.0, v));
+        if let Some(places) = &mut places {
+            places.push(DVec3::from(layout.mean.map(v)));
+        }
         let sh = incoming.push(
             layout.mean.map(|i| v(i) as f32),
             layout.quat.map(|i| v(i) as f32),

@@ -52,7 +52,7 @@ const FLAG_EXTENSIONS: u8 = 2;
 /// Scale of the colour byte.
 const COLOUR_SCALE: f64 = 0.15;
 /// Largest fixed-point coordinate: 24 bits with sign.
-const FIXED_MAX: f64 = 8_388_607.0;
+pub(super) const FIXED_MAX: f64 = 8_388_607.0;
 /// Largest number of fractional bits that is written.
 const FRACTION_MAX: i32 = 20;
 
@@ -91,6 +91,10 @@ impl Header {
     fn parse(b: &[u8], path: &Path) -> Result<Self> {
         if b.len() < HEADER {
             return Err(truncated(path, HEADER as u64, b.len() as u64));
+        }
+        if b.starts_with(b"ply\n") || b.starts_with(b"ply\r") {
+            let got = "a .ply compressed by gzip: unpack it first (gunzip)";
+            return Err(Error::format(path, "a .ply that is not compressed", got));
         }
         if b[..4] != MAGIC {
             return Err(Error::format(path, "the magic NGSP (.spz)", format!("{:02x?}", &b[..4])));
@@ -421,18 +425,16 @@ fn pack_rotation(q: [f32; 4]) -> [u8; 4] {
 
 /// Chooses the fractional bits, at most 20, with which `out` fits 24 bits with sign.
 ///
+/// Gaussians beyond 2²³ units are not in `out` ([`Outgoing::new`]).
+///
 /// # Errors
-/// Coordinates beyond 2²³ units; more Gaussians than readers accept.
+/// More Gaussians than readers accept.
 pub(super) fn fraction_bits(out: &Outgoing, path: &Path) -> Result<u32> {
     if out.count > COUNT_MAX as usize {
         let expected = format!("at most {COUNT_MAX} Gaussians in .spz");
         return Err(Error::format(path, expected, out.count.to_string()));
     }
     let reach = out.bounds.iter().flatten().fold(0.0f64, |m, v| m.max(f64::from(v.abs())));
-    if reach > FIXED_MAX {
-        let got = reach.to_string();
-        return Err(Error::format(path, "coordinates within 2^23 units for .spz", got));
-    }
     let bits = (FIXED_MAX / reach.max(1e-9)).log2().floor() as i32;
     Ok(bits.clamp(0, FRACTION_MAX) as u32)
 }

@@ -1,6 +1,6 @@
 //! safetensors files one tensor at a time, for files that are larger than memory.
 
-use crate::files::{Error, Result, write_atomic};
+use crate::files::{Error, Result, open_regular, write_atomic};
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 use serde_json::{Value, json};
@@ -63,7 +63,7 @@ impl TensorFile {
     fn open_at(path: &Path) -> Result<Self> {
         let bad = |got: String| Error::format(path, "a safetensors file", got);
         let io = |e| Error::io(path, e);
-        let mut file = File::open(path).map_err(io)?;
+        let mut file = open_regular(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
         let mut prefix = [0; LENGTH_BYTES as usize];
         if length < LENGTH_BYTES {

@@ -404,6 +404,7 @@ mod tests {
             origin: Default::default(),
             warnings: Vec::new(),
             left_out: Vec::new(),
+            other_sources: Vec::new(),
         }
     }
 

@@ -32,7 +32,7 @@ use std::path::Path;
 /// No file; no ffmpeg in PATH; a file that ffprobe does not read, without a video stream, or with a 360-degree video.
 pub fn probe_video(path: impl AsRef<Path>) -> Result<VideoInfo> {
     let path = path.as_ref();
-    std::fs::File::open(path).map_err(|e| crate::files::Error::io(path, e))?;
+    crate::files::open_regular(path).map_err(|e| crate::files::Error::io(path, e))?;
     process::check_installed(path)?;
     parse_ffprobe(&process::ffprobe(path)?, path)
 }

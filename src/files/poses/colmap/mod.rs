@@ -78,17 +78,28 @@ pub(super) fn count_images(folder: &Path) -> usize {
         let read = std::fs::File::open(binary).and_then(|mut file| file.read_exact(&mut count));
         return read.map_or(0, |()| u64::from_le_bytes(count) as usize);
     }
-    let path = folder.join("images.txt");
-    let bytes = read(&path).unwrap_or_default();
-    parse_images_txt(&path, &bytes, &mut Vec::new()).map_or(0, |images| images.len())
+    count_images_txt(&folder.join("images.txt"))
+}
+
+/// Number of pictures in an `images.txt`; 0 where it cannot be read.
+pub(super) fn count_images_txt(path: &Path) -> usize {
+    let bytes = read(path).unwrap_or_default();
+    parse_images_txt(path, &bytes, &mut Vec::new()).map_or(0, |images| images.len())
+}
+
+/// The `images.txt` of a folder that holds a binary model, which goes before it, and one as text.
+pub(super) fn second_text(folder: &Path) -> Option<PathBuf> {
+    (is_whole(folder, "bin") && is_whole(folder, "txt")).then(|| folder.join("images.txt"))
+}
+
+/// Reports whether `folder` holds the two files of a model that hold its cameras.
+fn is_whole(folder: &Path, extension: &str) -> bool {
+    ["cameras", "images"].iter().all(|stem| folder.join(format!("{stem}.{extension}")).is_file())
 }
 
 /// Reports whether `folder` holds a model.
 pub(super) fn is_model(folder: &Path) -> bool {
-    ["bin", "txt"].iter().any(|e| {
-        folder.join(format!("cameras.{e}")).is_file()
-            && folder.join(format!("images.{e}")).is_file()
-    })
+    ["bin", "txt"].iter().any(|extension| is_whole(folder, extension))
 }
 
 /// COLMAP's camera models by number: name and number of parameters. Models that [`lens`]
@@ -216,7 +227,16 @@ fn pose(q: [f64; 4], t: [f64; 3]) -> std::result::Result<(DQuat, DVec3), String>
 /// Reads the model in `folder`. Pictures may lie beside it, in its parents, and in an
 /// `images` folder of any of them.
 pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
-    let binary = folder.join("cameras.bin").is_file() && folder.join("images.bin").is_file();
+    load_form(folder, is_whole(folder, "bin"), reading)
+}
+
+/// Reads the model in `folder` from its files of text, where it has them.
+pub(super) fn load_text(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
+    let binary = is_whole(folder, "bin") && !is_whole(folder, "txt");
+    load_form(folder, binary, reading)
+}
+
+fn load_form(folder: &Path, binary: bool, reading: &Reading<'_>) -> Result<Scene> {
     let extension = if binary { "bin" } else { "txt" };
     let path = |stem: &str| folder.join(format!("{stem}.{extension}"));
     let (cameras_path, images_path, points_path) =
@@ -265,10 +285,13 @@ pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
         points.iter().enumerate().map(|(i, (id, _))| (*id, i as u32)).collect();
     let roots: Vec<PathBuf> = folder.ancestors().take(4).map(Path::to_owned).collect();
     let roots: Vec<&Path> = roots.iter().map(PathBuf::as_path).collect();
+    // The folders above the scene's may hold the pictures of other scenes.
+    let scene = roots.iter().position(|root| !is_layout(root)).unwrap_or(roots.len());
+    let own = &roots[..roots.len().min(scene + 1)];
     let drafts = images
         .into_iter()
-        .map(|image| draft(&images_path, image, &cameras, &index, &roots, reading))
-        .collect::<Result<Vec<_>>>()?;
+        .map(|image| draft(&images_path, image, &cameras, &index, [&roots, own], reading))
+        .collect();
     let mut scene = assemble(&images_path, SceneFormat::Colmap, reading, drafts)?;
     let origin = scene.origin;
     let place = |(_, p): (u64, DVec3)| (p - origin).as_vec3();
@@ -278,25 +301,33 @@ pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     Ok(scene)
 }
 
+/// Reports whether a folder has a name of COLMAP's layout: sparse/0, dense/0/sparse, colmap/sparse/0.
+fn is_layout(folder: &Path) -> bool {
+    let name = folder.file_name().unwrap_or_default().to_string_lossy();
+    ["sparse", "colmap", "dense"].contains(&&*name)
+        || (!name.is_empty() && name.chars().all(|c| c.is_ascii_digit()))
+}
+
 fn draft(
     path: &Path,
     image: ColmapImage,
     cameras: &Cameras,
     index: &HashMap<u64, u32>,
-    roots: &[&Path],
+    [roots, own]: [&[&Path]; 2],
     reading: &Reading<'_>,
-) -> Result<Draft> {
+) -> Draft {
     let camera = match cameras.get(&image.camera) {
         Some(Ok(camera)) => camera,
-        Some(Err(error)) => return Ok(Draft::refused(image.name, error.copy())),
+        Some(Err(error)) => return Draft::refused(image.name, error.copy()),
         None => {
             let got = format!("camera {}", image.camera);
-            return Err(Error::format(path, "a camera id of the cameras file", got).at(image.place));
+            let error = Error::format(path, "a camera id of the cameras file", got);
+            return Draft::refused(image.name, error.at(image.place));
         }
     };
     if let Some(got) = image.refused {
         let error = Error::format(path, "a finite pose with a quaternion above 0", got);
-        return Ok(Draft::refused(image.name, error.at(image.place)));
+        return Draft::refused(image.name, error.at(image.place));
     }
     // The inverse of (R, t): (Rᵀ, −Rᵀt).
     let back = image.rotation.conjugate();
@@ -305,11 +336,11 @@ fn draft(
         image.points.iter().filter_map(|id| index.get(id).copied()).collect();
     visible.sort_unstable();
     visible.dedup();
-    Ok(Draft {
-        image: reading.find(roots, &image.name),
+    Draft {
+        image: reading.find_of_scene(roots, own, &image.name),
         size: Some((camera.width, camera.height)),
         distortion: camera.distortion,
         visible,
         ..Draft::new(image.place, image.name, Lens::Pixels(camera.focal_and_center), pose)
-    })
+    }
 }

@@ -29,7 +29,7 @@ pub fn is_meta(path: impl AsRef<Path>) -> bool {
     if path.file_name().is_none_or(|name| !name.eq_ignore_ascii_case(super::META)) {
         return false;
     }
-    let Ok(file) = std::fs::File::open(path) else { return false };
+    let Ok(file) = crate::files::open_regular(path) else { return false };
     let mut text = Vec::new();
     let read = std::io::Read::read_to_end(&mut std::io::Read::take(file, PROBE), &mut text);
     read.is_ok() && serde_json::from_slice::<Meta>(&text).is_ok()

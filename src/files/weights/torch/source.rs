@@ -1,6 +1,6 @@
 //! Ranges of bytes of a file or of memory, and a forward stream over a range.
 
-use crate::files::{Error, Result};
+use crate::files::{Error, Result, open_regular};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -21,7 +21,7 @@ pub(super) enum Source {
 impl Source {
     pub(super) fn open(path: &Path) -> Result<Self> {
         let io = |e| Error::io(path, e);
-        let file = File::open(path).map_err(io)?;
+        let file = open_regular(path).map_err(io)?;
         let data = file.metadata().map_err(io)?;
         if data.is_dir() {
             return Err(Error::format(path, "a file of torch.save", "a folder"));

@@ -28,7 +28,14 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             args.out.display()
         );
     }
-    let spz = SplatFormat::from_name(&args.out) == Some(SplatFormat::Spz);
+    let format = SplatFormat::from_name(&args.out);
+    if !html && format.is_none_or(|format| format == SplatFormat::Ksplat) {
+        bail!(
+            "{}: expected a name that ends in .ply, .glb, .spz, .sog, .splat or .html",
+            args.out.display()
+        );
+    }
+    let spz = format == Some(SplatFormat::Spz);
     if args.spz_version.is_some() && !spz {
         bail!("--spz-version: only with a .spz, got {}", args.out.display());
     }
@@ -99,6 +106,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
         };
         page.write(&args.out, &save)
     })?;
+    report.notes().iter().for_each(print_warning);
     let kind =
         if html { "html".to_owned() } else { serde_json::to_value(report.format)?.to_string() };
     let kind = kind.trim_matches('"').to_owned();

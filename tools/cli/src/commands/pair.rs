@@ -9,7 +9,7 @@ use glam::{EulerRot, Mat4, Quat, Vec3};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
 use subsplat::cameras::estimation::{Confidence, PoseOptions, Uncertain};
-use subsplat::files::photos::folder::{FolderPhotographs, find_photographs};
+use subsplat::files::photos::folder::{FolderPhotographs, find_photographs, is_folder_of_masks};
 use subsplat::files::photos::image::{LoadOptions, Truncated, probe};
 use subsplat::files::photos::photograph::{PhotographHeader, probe_photograph};
 use subsplat::files::photos::video::is_video;
@@ -184,7 +184,7 @@ fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
     let mut name = folder.to_owned();
     let mut below: Vec<(PathBuf, FolderPhotographs)> = Vec::new();
     if found.photographs.is_empty() {
-        let photographs = |below: &PathBuf| !is_own_output(below) && !below.ends_with("masks");
+        let photographs = |below: &PathBuf| !is_own_output(below) && !is_folder_of_masks(below);
         let folders = folders(folder).into_iter().filter(photographs);
         below = folders.map(|folder| (folder.clone(), find_photographs(&folder))).collect();
         below.retain(|(_, found)| !found.photographs.is_empty());

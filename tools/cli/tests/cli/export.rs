@@ -224,7 +224,10 @@ fn export_refuses_what_it_cannot_write() {
     let place = workplace();
     save_one_splat(&place.path().join("one.ply"));
     for (arguments, words) in [
-        ("export one.ply -o two.obj", "two.obj: expected a name that ends in .ply"),
+        (
+            "export one.ply -o two.obj",
+            "two.obj: expected a name that ends in .ply, .glb, .spz, .sog, .splat or .html",
+        ),
         ("export one.ply -o two.ply --cameras scene", "--cameras: only .html files"),
         ("export one.ply -o two.ply --cameras none --gaussians 50%", "none"),
         ("export one.ply -o two.html --up y", "--up: a .html file"),
