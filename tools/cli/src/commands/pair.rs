@@ -453,7 +453,7 @@ mod tests {
         let paths = ["a.png", "b.png"].map(|n| folder.path().join(n));
         paths.iter().for_each(|p| std::fs::write(p, &png).unwrap());
         let flags = Flags::parse_from(["pair", "--fov", "60", "--move", "1,0,0"]);
-        let scene = load(&paths, &flags.pair, &ProgressBar::hidden()).unwrap();
+        let Loaded { scene, .. } = load(&paths, &flags.pair, &[], &ProgressBar::hidden()).unwrap();
         let (picture, camera) = scene.frames[0].load().unwrap();
         assert_eq!((picture.width, picture.height), (6, 8));
         let k = camera.intrinsics();

@@ -23,7 +23,7 @@ use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
 use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
 use subsplat::reconstruct::stages::located;
-use subsplat::reconstruct::{Assessment, Backend};
+use subsplat::reconstruct::{Assessment, Backend, Trust};
 use subsplat::scene::render::{
     comment_of_camera, comment_of_options, comment_of_origin, comment_of_photograph,
 };
@@ -550,6 +550,13 @@ impl Done {
             print_warning(
                 "the estimated cameras are doubtful, and with them every view of the scene",
             );
+        }
+        let others = &plan.scene.other_sources;
+        if self.assessment.verdict.trust == Trust::Wrong && !others.is_empty() {
+            let others = others.join(", ");
+            print_warning(format!(
+                "the scene has other cameras too: {others} (--model reads them)"
+            ));
         }
         if args.formats().contains(&SceneFormatArg::Html) {
             let page = args.out.join(SceneFormatArg::Html.file_name());
