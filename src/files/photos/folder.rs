@@ -241,7 +241,9 @@ mod tests {
         assert_eq!(found.photographs, ["a.png", "b9.jfif", "b10.png", "c"].map(path));
         let copies = found.notes().into_iter().find(|note| note.contains("a copy of b10.png"));
         assert!(copies.is_some_and(|n| n.contains("b10 (2).png, b10 (1).png")), "{found:?}");
-        ["a.png", "b10 (1).png", "b10 (2).png"].map(|n| std::fs::remove_file(path(n)).unwrap());
+        for extra in ["a.png", "b10 (1).png", "b10 (2).png"] {
+            std::fs::remove_file(path(extra)).unwrap();
+        }
         // A folder of nothing but `images`.
         std::fs::create_dir(path("inner")).unwrap();
         std::fs::rename(path("c"), path("inner/c")).unwrap();

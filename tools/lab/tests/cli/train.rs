@@ -490,7 +490,7 @@ fn killed_trainings_get_the_weights_of_an_unstopped_one() {
     assert_eq!(code, 0, "{stderr}");
     let time = start.elapsed().as_secs_f64();
     let kills: u32 = std::env::var("SUBSPLAT_KILLS").map_or(4, |n| n.parse().unwrap());
-    let mut reached = Vec::new();
+    let mut reached: Vec<u64> = Vec::new();
     for kill in 0..kills {
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_subsplat-lab"));
         command.args("train t.toml --out killed".split_whitespace()).current_dir(folder.path());
