@@ -2,8 +2,9 @@
 //!
 //! A pose file names them (nerfstudio's `mask_path`), or they lie in a folder `masks` beside the folder of the
 //! photographs, `images` or a reduced copy as `images_4`, or in it: `masks/NAME.jpg.png` (COLMAP) or
-//! `masks/NAME.png`. The folder may be called `mask` or `masks_2` too ([`FOLDERS`]). A mask belongs to the stored pixels, as COLMAP and nerfstudio have it; one of the shape of
-//! the upright pixels alone belongs to those. A JPEG has noise, so its values below 128 are masked.
+//! `masks/NAME.png`. The folder may be called `mask` or `masks_2` too ([`FOLDERS`]). A mask belongs to the stored
+//! pixels, as COLMAP and nerfstudio have it; one of the shape of the upright pixels alone belongs to those. A JPEG has
+//! noise, so its values below 128 are masked.
 //!
 //! A mask in an alpha channel is read with its picture (`decode.rs`).
 

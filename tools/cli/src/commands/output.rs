@@ -414,6 +414,7 @@ pub fn write_scene(args: &RunArgs, page: &Page<'_>, options: &SaveOptions) -> Re
             true => page.write_within(&path, options, PAGE_BYTES, &mut Renderer::default())?,
             false => save_splats(&path, page.splats, options)?,
         };
+        saved.notes().iter().for_each(print_warning);
         let mut value = serde_json::to_value(&saved)?;
         if html {
             value["format"] = json!("html");

@@ -125,7 +125,7 @@ fn broken_files() {
         ("run scene/images -o scene/images", "scene/images: holds the photographs that are read"),
         (
             "run scene/images/view0.png scene/images/view1.png -o scene.ply/out",
-            "got a file (scene.ply)",
+            "scene.ply/out: expected a folder, got a file",
         ),
         ("info unclosed", "cameras.json:"),
         ("render scene.ply", "scene.ply"),
@@ -234,7 +234,7 @@ fn impossible_values_are_wrong_usage() {
         ("render a.ply --sh-degree 5", "from 0 to 4"),
         ("render a.ply --near 0", "above 0"),
         ("render a.ply --size 0x5", "N or WxH"),
-        ("run scene --size huge", "N or WxH, 1 to 32768 pixels a side, or `photo`"),
+        ("run scene --size huge", "N or WxH, 11 to 32768 pixels a side, or `photo`"),
         ("render a.ply --frames 0", "from 1 to 100000"),
     ];
     for (arguments, named) in rows {
