@@ -45,7 +45,7 @@ fn load(bytes: &[u8]) -> SplatFile {
 
 /// Splats within 3 units.
 fn near_places() -> Vec<DVec3> {
-    (0..90).map(|i| f64::from(i)).map(|t| DVec3::new(t.sin(), 0.02 * t, (1.7 * t).cos())).collect()
+    (0..90).map(f64::from).map(|t| DVec3::new(t.sin(), 0.02 * t, (1.7 * t).cos())).collect()
 }
 
 #[test]

@@ -77,6 +77,7 @@ function ask(message, transfer = []) {
 const ADVICE = [
   [/give --fov or --intrinsics/, "fill in the field “Focal length”"],
   [/give --fov/, "fill in the field “Focal length”"],
+  [/a folder `masks` leaves such pixels/, "pictures with transparent pixels leave these"],
   [/, and give these with --fov 90/, ", and choose these with a focal length of 18 mm"],
   [/; or build with the feature `heic`/, ""],
   [/; the program estimates them from the photographs alone, without the file of cameras/, "; other photographs may help"],
