@@ -554,7 +554,8 @@ fn icc_profiles_are_converted_to_srgb() {
     assert_eq!(parse(&red).image.data, [255, 0, 0]);
     // Transparency is blended with black after the conversion.
     let expected = converted([180, 90, 60], DISPLAY_P3, srgb_linear).map(|v| v * 128.0 / 255.0);
-    let half = png(&[180, 90, 60, 128], [1, 1], ExtendedColorType::Rgba8, None, Some(p3.clone()));
+    let half = [180, 90, 60, 128, 0, 0, 0, 255];
+    let half = png(&half, [2, 1], ExtendedColorType::Rgba8, None, Some(p3.clone()));
     for (f, e) in parse(&half).image.data.iter().zip(expected) {
         assert!((f64::from(*f) - e).abs() <= 1.0, "{:?} {expected:?}", parse(&half).image.data);
     }
@@ -638,18 +639,23 @@ fn every_pixel_format_is_right_or_refused() {
     for (case, bytes, expected) in [
         ("grey", png(&[77], [1, 1], L8, None, None), [77; 3]),
         ("grey 16", png(&wide(257 * 77 + 20), [1, 1], L16, None, None), [77; 3]),
-        ("grey alpha", png(&[200, 128], [1, 1], La8, None, None), [100; 3]),
+        // The second pixel is opaque: an alpha that is the same everywhere is none.
+        ("grey alpha", png(&[200, 128, 0, 255], [2, 1], La8, None, None), [100; 3]),
         (
             "grey alpha 16",
-            png(&[wide(257 * 200), wide(257 * 128)].concat(), [1, 1], La16, None, None),
+            png(&[200u16, 128, 0, 255].map(|v| wide(257 * v)).concat(), [2, 1], La16, None, None),
             [100; 3],
         ),
-        ("RGBA", png(&[200, 100, 255, 128], [1, 1], Rgba8, None, None), [100, 50, 128]),
+        (
+            "RGBA",
+            png(&[200, 100, 255, 128, 0, 0, 0, 255], [2, 1], Rgba8, None, None),
+            [100, 50, 128],
+        ),
         (
             "RGBA 16",
             png(
-                &[200u16, 100, 255, 128].map(|v| wide(257 * v)).concat(),
-                [1, 1],
+                &[200u16, 100, 255, 128, 0, 0, 0, 255].map(|v| wide(257 * v)).concat(),
+                [2, 1],
                 Rgba16,
                 None,
                 None,
