@@ -150,7 +150,7 @@ fn many_scenes_in_one_process_are_equal_and_leave_nothing() {
         *least = least.min(resident());
     }
     println!(
-        "{runs} scenes: {:.0} MiB after the first half, {:.0} after all",
+        "{runs} scenes: at least {:.0} MiB in the first half, {:.0} later",
         memory[0], memory[1]
     );
     assert!(memory[1] - memory[0] < NOISE, "{memory:?} MiB");
