@@ -368,8 +368,8 @@ fn check_jpeg(
 const ALPHA_KEPT: u8 = 128;
 
 /// Rounds to 8 bits, and makes a mask of an alpha channel. An alpha that is the same everywhere is none: some writers
-/// of BMP and TIFF leave a fourth band of zeros. A mask is an alpha that masks a pixel. Transparency is blended with black, but for pixels that a mask keeps: those at the rim of an
-/// object would be darker than it.
+/// of BMP and TIFF leave a fourth band of zeros. A mask is an alpha that masks a pixel. Transparency is blended with
+/// black, but for pixels that a mask keeps: those at the rim of an object would be darker than it.
 fn to_rgb(pixels: DynamicImage) -> (Rgb, Option<Mask>) {
     let (width, height) = (pixels.width() as usize, pixels.height() as usize);
     let opaque =

@@ -98,12 +98,16 @@ fn in_folder(folder: &Path) -> FolderPhotographs {
                 Err(Error::Io { source, .. }) => source.to_string(),
             }
         };
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        found.left_out.push([name, reason]);
+        found.left_out.push([name_of(&path), reason]);
     }
     leave_out_twins(&mut found);
     leave_out_copies(&mut found);
     found
+}
+
+/// Name of a file without its folders.
+fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// Leaves out files that equal another one byte for byte, such as `a (1).jpg` beside `a.jpg`: they show one place. The
@@ -116,10 +120,7 @@ fn leave_out_copies(found: &mut FolderPhotographs) {
             of_size.entry(metadata.len()).or_default().push(i);
         }
     }
-    let name = |i: usize| {
-        let path: &Path = &found.photographs[i];
-        path.file_name().unwrap_or_default().to_string_lossy().into_owned()
-    };
+    let name = |i: usize| name_of(&found.photographs[i]);
     let mut copies: Vec<(usize, String)> = Vec::new();
     for mut same in of_size.into_values().filter(|same| same.len() > 1) {
         same.sort_by_key(|&i| (name(i).len(), i));
@@ -135,8 +136,7 @@ fn leave_out_copies(found: &mut FolderPhotographs) {
     copies.sort();
     for (i, reason) in copies.iter().rev() {
         let path = found.photographs.remove(*i);
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        found.left_out.push([name, reason.clone()]);
+        found.left_out.push([name_of(&path), reason.clone()]);
     }
 }
 
@@ -153,8 +153,8 @@ fn leave_out_twins(found: &mut FolderPhotographs) {
         let is_twin =
             !is_common(path) && has_format_of_its_own(path) && common.contains(&stem(path));
         if is_twin {
-            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            left_out.push([name, "a JPEG, PNG or TIFF of the same name is read".to_owned()]);
+            left_out
+                .push([name_of(path), "a JPEG, PNG or TIFF of the same name is read".to_owned()]);
         }
         !is_twin
     });

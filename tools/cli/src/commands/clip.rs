@@ -1,7 +1,6 @@
 //! A video as input: frames of it become a folder of photographs, which the command then reads.
 
 use super::args::{PathArg, PosesArgs, RunArgs};
-use super::output;
 use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use indicatif::ProgressBar;
@@ -37,15 +36,12 @@ impl<A> OfVideo<A> {
 /// Arguments of `run` that read the frames of a video, where the input is one.
 ///
 /// # Errors
-/// Those of [`video_of`] and of the library's `take_frames`; `--take` without a video; a number out of its range;
-/// an output folder that cannot be used.
+/// Those of [`video_of`] and of the library's `take_frames`; `--take` without a video; a number out of its range.
 pub fn of_run(args: &RunArgs, progress: &mut Progress) -> Result<Option<OfVideo<RunArgs>>> {
     let Some(video) = video_of(&args.input)? else {
         ensure!(args.take.is_none(), "--take: only with a video, got photographs or a scene");
         return Ok(None);
     };
-    // The frames are written into this folder.
-    output::check(&args.out, &args.input)?;
     let mut frames = args.clone();
     let count = match args.take {
         // Without a path, --frames has no other meaning for a video.

@@ -55,10 +55,11 @@ struct Plan {
 pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     args.motion.video.as_deref().map_or(Ok(()), video::check)?;
+    // Before the frames of a video are written into the folder.
+    output::check(&args.out, &args.input)?;
     let of_video = clip::of_run(args, &mut progress)?;
     let clip = of_video.as_ref();
     let args = clip.map_or(args, |of_video| &of_video.args);
-    output::check(&args.out, &args.input)?;
     // Before the cameras: weights that cannot be read are an error before any work.
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);
