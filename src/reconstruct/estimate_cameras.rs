@@ -1,13 +1,19 @@
 //! Estimates the cameras of photographs without a pose file: decodes them, takes what is known of
 //! their lenses, estimates the poses ([`crate::cameras::estimation`]), and returns photographs or a scene.
+//!
+//! Where the photographs show that their lens bends straight lines, they are straightened and their cameras estimated
+//! again ([`RadialLens`]).
 
-use super::projections::{self, Posed, Projection, Shapes};
+use super::projections::{self, Posed, Prepared, Projection, Shapes};
 use super::{Error, Photo, Result};
-use crate::cameras::estimation::{Lens, PoseEstimate, PoseOptions, PosePhoto, estimate_poses};
+use crate::cameras::estimation::{
+    Confidence, Lens, PoseEstimate, PoseOptions, PosePhoto, PoseWarning, RadialLens, estimate_poses,
+};
 use crate::files::photos::exif::FocalSource;
 use crate::files::photos::image::LoadOptions;
 use crate::files::photos::notes::grouped;
 use crate::files::photos::photograph::Photograph;
+use crate::files::photos::views::Cut;
 use crate::files::poses::scene::{Scene, SceneFormat};
 use std::fmt;
 use std::path::Path;
@@ -70,7 +76,8 @@ pub struct EstimateOptions {
     /// Decoding by [`estimate_cameras_of_files`].
     pub load: LoadOptions,
     /// Projection of the photographs of [`estimate_cameras_of_files`]. With panoramas and fisheye pictures
-    /// [`EstimateOptions::lens`] has no effect.
+    /// [`EstimateOptions::lens`] has no effect. [`estimate_cameras`] reads [`Projection::Pinhole`] alone: lenses do not
+    /// bend lines.
     pub projection: Projection,
 }
 
@@ -85,6 +92,8 @@ pub struct EstimatedScene {
     pub estimate: PoseEstimate,
     /// Origin of each photograph's focal length.
     pub lenses: Vec<LensSource>,
+    /// The lens whose bend was taken out of the photographs: the frames are straight views of them.
+    pub straightened: Option<RadialLens>,
 }
 
 /// Result of [`estimate_cameras`]: photographs in memory with estimated cameras.
@@ -97,6 +106,8 @@ pub struct EstimatedPhotos {
     pub estimate: PoseEstimate,
     /// Origin of each photograph's focal length.
     pub lenses: Vec<LensSource>,
+    /// The lens whose bend was taken out of the photographs.
+    pub straightened: Option<RadialLens>,
 }
 
 /// Features of a photograph of a pair, and of one of many: the time of matching grows with their
@@ -126,23 +137,63 @@ pub fn estimate_cameras(
         let Photograph { image, mask, .. } = photograph;
         pose_photos.push(PosePhoto::from_picture(image, mask.as_ref(), lens, features)?);
     }
-    let estimate = estimate_poses(&pose_photos, &options.poses).map_err(|reason| {
+    let first = estimate_poses(&pose_photos, &pose_options(options)).map_err(|reason| {
         let warnings = photographs.iter().flat_map(|p| p.warnings.clone()).collect();
         let photographs = format!("{} photographs", photographs.len());
         Error::NoPoses { photographs, reason, warnings }
     })?;
-    let photos = photographs
-        .into_iter()
-        .zip(&estimate.cameras)
-        .filter_map(|(photograph, camera)| {
-            let photo = Photo::new(photograph.image, (*camera)?);
-            Some(match photograph.mask {
-                Some(mask) => photo.and_then(|photo| photo.with_mask(mask)),
-                None => photo,
-            })
-        })
-        .collect::<Result<_>>()?;
-    Ok(EstimatedPhotos { photos, estimate, lenses })
+    let straight = |radial| -> Result<(Vec<PosePhoto>, Vec<Cut>)> {
+        let one = |photograph| -> Result<(PosePhoto, Cut)> {
+            let cut = projections::straight_view(photograph, options.lens, radial)?;
+            let photo = projections::straight_photo(photograph, &cut, options.lens, features)?.0;
+            Ok((photo, cut))
+        };
+        Ok(photographs.iter().map(one).collect::<Result<Vec<_>>>()?.into_iter().unzip())
+    };
+    let (estimate, straightened) = straight_estimate(first, options, straight);
+    let cuts = straightened.as_ref().map(|(_, cuts)| cuts);
+    let mut photos = Vec::new();
+    for (i, (photograph, camera)) in photographs.into_iter().zip(&estimate.cameras).enumerate() {
+        let Some(camera) = *camera else { continue };
+        let Photograph { image, mask, .. } = photograph;
+        let (image, mask) = match cuts.map(|cuts| cuts[i]) {
+            Some(cut) => cut.apply(&image, mask.as_ref()),
+            None => (image, mask),
+        };
+        let photo = Photo::new(image, camera)?;
+        photos.push(match mask {
+            Some(mask) => photo.with_mask(mask)?,
+            None => photo,
+        });
+    }
+    let straightened = straightened.map(|(radial, _)| radial);
+    Ok(EstimatedPhotos { photos, estimate, lenses, straightened })
+}
+
+/// Options of the first estimate: photographs of known projections have lenses that do not bend lines.
+fn pose_options(options: &EstimateOptions) -> PoseOptions {
+    let may_bend = options.poses.may_bend && options.projection == Projection::Detected;
+    options.poses.with_may_bend(may_bend)
+}
+
+/// The estimate of straightened photographs where `first` found a lens that bends, with that lens and what
+/// `straightened` made beside the photographs; else `first`, which is doubtful where straightening failed.
+fn straight_estimate<T>(
+    mut first: PoseEstimate,
+    options: &EstimateOptions,
+    straightened: impl FnOnce(RadialLens) -> Result<(Vec<PosePhoto>, T)>,
+) -> (PoseEstimate, Option<(RadialLens, T)>) {
+    let Some(radial) = first.radial else { return (first, None) };
+    let placed = |estimate: &PoseEstimate| estimate.cameras.iter().flatten().count();
+    if let Ok((photos, made)) = straightened(radial)
+        && let Ok(estimate) = estimate_poses(&photos, &options.poses.with_may_bend(false))
+        && placed(&estimate) >= placed(&first)
+    {
+        return (estimate, Some((radial, made)));
+    }
+    first.warnings.push(PoseWarning::BentLines);
+    first.confidence = Confidence::Low;
+    (first, None)
 }
 
 /// Estimates the cameras of photographs in files. `name` names the scene in messages.
@@ -179,17 +230,35 @@ fn estimate_scene(
         prepared.push(one);
     }
     let mut warnings = grouped(photographs.iter().copied().zip(said.iter().map(Vec::as_slice)));
-    let shapes = Shapes::new(&prepared);
-    let (photos, lenses): (Vec<PosePhoto>, Vec<LensSource>) =
-        prepared.into_iter().map(|p| (p.photo, p.source)).unzip();
+    let split = |prepared: Vec<Prepared>| {
+        let shapes = Shapes::new(&prepared);
+        let (photos, lenses): (Vec<PosePhoto>, Vec<LensSource>) =
+            prepared.into_iter().map(|p| (p.photo, p.source)).unzip();
+        (photos, (shapes, lenses))
+    };
+    let (photos, (mut shapes, lenses)) = split(prepared);
     warnings.extend(shapes.warning(&lenses));
-    let estimate = match estimate_poses(&photos, &options.poses) {
+    let first = match estimate_poses(&photos, &pose_options(options)) {
         Ok(estimate) => estimate,
         Err(reason) => {
             let photographs = photographs_of(name, photographs);
             return Err(Error::NoPoses { photographs, reason, warnings });
         }
     };
+    drop(photos);
+    let straight = |radial| -> Result<_> {
+        let one = |path: &&Path| projections::prepare_straight(path, options, radial, features);
+        let mut prepared = photographs.iter().map(one).collect::<Result<Vec<_>>>()?;
+        let said: Vec<_> = prepared.iter_mut().map(|p| std::mem::take(&mut p.warnings)).collect();
+        let (photos, (shapes, _)) = split(prepared);
+        Ok((photos, (shapes, said)))
+    };
+    let (estimate, straightened) = straight_estimate(first, options, straight);
+    let straightened = straightened.map(|(radial, (of_views, said))| {
+        shapes = of_views;
+        warnings.extend(grouped(photographs.iter().copied().zip(said.iter().map(Vec::as_slice))));
+        radial
+    });
     let Posed { views, observations } = shapes.posed(photographs, &estimate);
     let mut scene = Scene::from_views(SceneFormat::Photographs, name, &views)?;
     scene.points = Some(estimate.points.iter().map(|p| p.position).collect());
@@ -204,7 +273,7 @@ fn estimate_scene(
     let file = |photo: usize| photographs[photo].display().to_string();
     scene.warnings.extend(estimate.left_out_sentences(file));
     scene.warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
-    Ok(EstimatedScene { scene, observations, estimate, lenses })
+    Ok(EstimatedScene { scene, observations, estimate, lenses, straightened })
 }
 
 /// Returns the known part of a photograph's lens, and its source.
@@ -224,5 +293,40 @@ fn photographs_of(name: &Path, photographs: &[&Path]) -> String {
     match photographs {
         [a, b] => format!("{} and {}", a.display(), b.display()),
         _ => format!("{} ({} photographs)", name.display(), photographs.len()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cameras::estimation::FocalEstimate;
+    use crate::files::Error as FileError;
+
+    #[test]
+    fn cameras_of_a_lens_that_cannot_be_straightened_are_doubtful() {
+        let radial = RadialLens { k: -0.3, focal_scale: 0.9 };
+        let mut first = PoseEstimate {
+            cameras: vec![None; 3],
+            points: Vec::new(),
+            left_out: Vec::new(),
+            focal: FocalEstimate { scale: 1.0, deviation: 0.0 },
+            radial: None,
+            confidence: Confidence::High,
+            rotation_error_deg: 0.0,
+            direction_error_deg: 0.0,
+            warnings: Vec::new(),
+        };
+        let options = EstimateOptions::default();
+        let found = straight_estimate(first.clone(), &options, |_| Ok((Vec::new(), ())));
+        assert_eq!(found, (first.clone(), None));
+        first.radial = Some(radial);
+        // No photographs have no cameras.
+        let (estimate, straightened) =
+            straight_estimate(first.clone(), &options, |lens| Ok((Vec::new(), lens)));
+        assert_eq!((estimate.confidence, straightened), (Confidence::Low, None));
+        assert_eq!(estimate.warnings, [PoseWarning::BentLines]);
+        let failed = |_| Err(FileError::format("a.png", "a lens", "none".to_owned()).into());
+        let (estimate, straightened) = straight_estimate::<()>(first, &options, failed);
+        assert_eq!((estimate.confidence, straightened), (Confidence::Low, None));
     }
 }

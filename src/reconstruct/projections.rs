@@ -1,14 +1,15 @@
 //! Photographs of several projections before and after the estimation of their cameras: pinhole photographs,
-//! pictures of fisheye lenses (one pinhole view of each), and panoramas (views of one centre with known
-//! rotations).
+//! pictures of fisheye lenses and of lenses that bend lines (one pinhole view of each), and panoramas (views of one
+//! centre with known rotations).
 
 use super::Result;
-use super::estimate_cameras::{EstimateOptions, LensSource, lens};
-use crate::cameras::estimation::{Lens, PhotoView, PoseEstimate, PosePhoto, PosePoint};
+use super::estimate_cameras::{EstimateOptions, KnownLens, LensSource, lens};
+use crate::cameras::estimation::{Lens, PhotoView, PoseEstimate, PosePhoto, PosePoint, RadialLens};
 use crate::files::Error as FileError;
 use crate::files::photos::distortion::Distortion;
 use crate::files::photos::photograph::{Photograph, load_photograph_or_panorama, panorama_shape};
 use crate::files::photos::shape::{ImageCircle, edges_meet, image_circle};
+use crate::files::photos::undistort;
 use crate::files::photos::views::{
     Cut, YAWS, fisheye_cut, has_panorama_shape, own_axes, panorama_cut, panorama_view, shared_axes,
     view_label,
@@ -90,8 +91,8 @@ impl FisheyeCurve {
 #[allow(clippy::large_enum_variant, reason = "one of each photograph")]
 enum Shape {
     Pinhole,
-    /// The estimated camera is that of the view.
-    Fisheye(Cut),
+    /// One pinhole view, of which the estimated camera is.
+    View(Cut),
     /// The estimated camera is the panorama's.
     Panorama {
         width: usize,
@@ -225,8 +226,76 @@ fn of_fisheye(
         Lens::stated(fx, width, height),
         features,
     )?;
-    let shape = Shape::Fisheye(cut);
+    let shape = Shape::View(cut);
     Ok(Prepared { photo, source: LensSource::Fisheye, warnings, shape })
+}
+
+/// Loads a photograph again and straightens what its lens bends.
+///
+/// # Errors
+/// A photograph that cannot be read; a lens of which no rectangle can be straightened.
+pub(super) fn prepare_straight(
+    path: &Path,
+    options: &EstimateOptions,
+    radial: RadialLens,
+    features: usize,
+) -> Result<Prepared> {
+    let photograph = load_photograph_or_panorama(path, &options.load)?.0;
+    let cut = straight_view(&photograph, options.lens, radial)?;
+    let (photo, source) = straight_photo(&photograph, &cut, options.lens, features)?;
+    let warnings = vec![format!("{}: {}", path.display(), straightened(&cut))];
+    Ok(Prepared { photo, source, warnings, shape: Shape::View(cut) })
+}
+
+/// The largest pinhole view of a photograph whose lens bends.
+///
+/// # Errors
+/// A lens of which no rectangle can be straightened.
+pub(super) fn straight_view(
+    photograph: &Photograph,
+    known: Option<KnownLens>,
+    radial: RadialLens,
+) -> Result<Cut> {
+    let mut of_middle = lens(photograph, known).0.intrinsics;
+    of_middle.fx *= radial.focal_scale as f32;
+    of_middle.fy *= radial.focal_scale as f32;
+    let distortion = Distortion::Division { k: radial.k };
+    let view = undistort::pinhole(&of_middle, &distortion)
+        .map_err(|got| FileError::format("photograph", "a lens that can be straightened", got))?;
+    Ok(Cut { lens: of_middle, distortion, lens_from_view: DMat3::IDENTITY, view })
+}
+
+/// Says how a photograph was straightened.
+fn straightened(cut: &Cut) -> String {
+    let corner = undistort::ray(&cut.lens, DVec2::ZERO);
+    // The corner's own distance from the middle over that of a pinhole's picture of the same thing.
+    let percent = match cut.distortion {
+        Distortion::Division { k } => -100.0 * k * corner.length_squared(),
+        _ => 0.0,
+    };
+    let side = if percent > 0.0 { "near to" } else { "far from" };
+    format!(
+        "the lens bends straight lines (things in the corners are seen {:.0} % too {side} the middle): straightened; \
+         --lens pinhole reads photographs as they are",
+        percent.abs()
+    )
+}
+
+/// Features of the view `cut` of a photograph, and the origin of its focal length.
+///
+/// # Errors
+/// A view that is no camera.
+pub(super) fn straight_photo(
+    photograph: &Photograph,
+    cut: &Cut,
+    known: Option<KnownLens>,
+    features: usize,
+) -> Result<(PosePhoto, LensSource)> {
+    let (picture, mask) = cut.apply(&photograph.image, photograph.mask.as_ref());
+    let Intrinsics { width, height, fx, .. } = cut.view;
+    let lens_of_view = Lens::stated(fx, width, height);
+    let photo = PosePhoto::from_picture(&picture, mask.as_ref(), lens_of_view, features)?;
+    Ok((photo, lens(photograph, known).1))
 }
 
 /// Frames of photographs with estimated cameras.
@@ -276,7 +345,7 @@ impl Shapes {
                 |cut| PosedView { photograph: path.to_owned(), cut, label: String::new(), camera };
             match shape {
                 Shape::Pinhole => views.push(one(None)),
-                Shape::Fisheye(cut) => views.push(one(Some(cut))),
+                Shape::View(cut) => views.push(one(Some(cut))),
                 Shape::Panorama { width, height } => {
                     let (rotation, position) = axes_and_position(&camera);
                     for (n, view) in axes.iter().enumerate() {

@@ -1,12 +1,13 @@
-//! Bundle adjustment: all cameras, all points and a shared focal length together.
+//! Bundle adjustment: all cameras, all points and a shared lens (focal length, bend) together.
 //!
 //! Levenberg-Marquardt steps on the robust sum of squared distances between the points' pictures
 //! and their projections. The points are eliminated (Schur complement), so that a step solves one
-//! dense system of 6 unknowns a camera and one for the focal length. The first camera is kept.
+//! dense system of 6 unknowns a camera and two for the lens. The first camera is kept.
 //!
 //! Source: B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000.
 
 use super::absolute::{Absolute, in_view, matrix as converted, projection_slope, slope_in_camera};
+use super::bend;
 use super::refine::FocalPrior;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
@@ -18,7 +19,7 @@ pub(super) struct Observation {
     pub camera: usize,
     /// Index into [`Bundle::points`].
     pub point: usize,
-    /// The picture on the plane z = 1 of the lens's own focal length.
+    /// The picture on the plane z = 1 of the lens's own focal length, as the lens bends it.
     pub bearing: DVec2,
     /// Standard deviation of the bearing, units of the plane.
     pub deviation: f64,
@@ -39,26 +40,34 @@ pub(super) struct Bundle {
     pub log_focal: f64,
     /// Knowledge of the focal length; `None` keeps it.
     pub prior: Option<FocalPrior>,
+    /// Bend k of the lens ([`bend`]).
+    pub bend: f64,
+    /// Standard deviation of what is known of [`Bundle::bend`], whose mean is 0; `None` keeps it.
+    pub bend_prior: Option<f64>,
 }
 
 /// Residual at which Cauchy's loss begins to grow slowly, standard deviations.
 const LOSS_SCALE: f64 = 2.0;
 /// Unknowns of a camera.
 const POSE: usize = 6;
+/// Unknowns of the lens: logarithm of the focal length, bend.
+const LENS: usize = 2;
 
 type Slope = SMatrix<f64, 2, 6>;
 type PointSlope = SMatrix<f64, 2, 3>;
 
 impl Observation {
-    /// Residual, standard deviations; `None` behind the camera.
-    pub(super) fn residual(
+    /// Residual, standard deviations; `None` behind the camera, and where the lens has no picture.
+    fn residual(
         &self,
         camera: &Absolute,
         point: DVec3,
         log_focal: f64,
+        bend: f64,
     ) -> Option<DVec2> {
         let p = in_view(self.view, camera.to_camera(point));
-        let projected = p.truncate() / p.z * log_focal.exp();
+        let straight = p.truncate() / p.z * log_focal.exp();
+        let projected = if bend == 0.0 { straight } else { bend::bent(straight, bend)? };
         (p.z > 1e-9).then(|| (projected - self.bearing) / self.deviation)
     }
 }
@@ -71,27 +80,30 @@ struct Reduced {
     points: Vec<(SMatrix<f64, 3, 3>, SVector<f64, 3>)>,
     /// For each observation the product of the slopes of camera and point.
     mixed: Vec<SMatrix<f64, 6, 3>>,
-    /// For each point the product of the slopes of focal length and point.
-    focal: Vec<SVector<f64, 3>>,
+    /// For each point the product of the slopes of point and lens.
+    lens: Vec<SMatrix<f64, 3, 2>>,
 }
 
 impl Bundle {
     fn unknowns(&self) -> usize {
-        POSE * (self.cameras.len() - 1) + 1
+        POSE * (self.cameras.len() - 1) + LENS
+    }
+
+    fn residual(&self, o: &Observation) -> Option<DVec2> {
+        o.residual(&self.cameras[o.camera], self.points[o.point], self.log_focal, self.bend)
     }
 
     /// Sum of Cauchy's losses, and of the prior.
     fn cost(&self) -> f64 {
         let c2 = LOSS_SCALE * LOSS_SCALE;
         let one = |o: &Observation| {
-            let residual =
-                o.residual(&self.cameras[o.camera], self.points[o.point], self.log_focal);
             // A point behind the camera costs as much as a large residual.
-            let squared = residual.map_or(1e8, |r| r.length_squared());
+            let squared = self.residual(o).map_or(1e8, |r| r.length_squared());
             0.5 * c2 * (squared / c2).ln_1p()
         };
         let data: f64 = self.observations.iter().map(one).sum();
-        data + self.prior.map_or(0.0, |p| 0.5 * p.distance(self.log_focal).powi(2))
+        let focal = self.prior.map_or(0.0, |p| 0.5 * p.distance(self.log_focal).powi(2));
+        data + focal + self.bend_prior.map_or(0.0, |d| 0.5 * (self.bend / d).powi(2))
     }
 
     /// Improves all unknowns in at most `steps` steps.
@@ -125,53 +137,70 @@ impl Bundle {
     /// Builds the normal equations; `damping` is added to the diagonal in proportion.
     fn reduce(&self, damping: f64) -> Reduced {
         let n = self.unknowns();
-        let last = n - 1;
+        let lens_at = n - LENS;
         let scale = self.log_focal.exp();
+        // Unknowns that are kept have no slope.
+        let free = SVector::<f64, LENS>::new(
+            f64::from(u8::from(self.prior.is_some())),
+            f64::from(u8::from(self.bend_prior.is_some())),
+        );
         let mut matrix = DMatrix::<f64>::zeros(n, n);
         let mut gradient = DVector::<f64>::zeros(n);
         let mut own = vec![SMatrix::<f64, 3, 3>::zeros(); self.points.len()];
         let mut own_gradient = vec![SVector::<f64, 3>::zeros(); self.points.len()];
-        let mut focal = vec![SVector::<f64, 3>::zeros(); self.points.len()];
+        let mut lens = vec![SMatrix::<f64, 3, LENS>::zeros(); self.points.len()];
         let mut mixed = vec![SMatrix::<f64, 6, 3>::zeros(); self.observations.len()];
         for (o, mixed) in self.observations.iter().zip(&mut mixed) {
             let camera = &self.cameras[o.camera];
             let point = self.points[o.point];
-            let Some(r) = o.residual(camera, point, self.log_focal) else { continue };
+            let Some(r) = self.residual(o) else { continue };
             let weight = 1.0 / (1.0 + r.length_squared() / (LOSS_SCALE * LOSS_SCALE));
             let p = in_view(o.view, camera.to_camera(point));
+            let straight = p.truncate() / p.z * scale;
+            let (bent, by_bend) = bend::bent_slopes(straight, self.bend);
+            let bent = SMatrix::<f64, 2, 2>::from_column_slice(&bent.to_cols_array());
             let unit = scale / o.deviation;
             let rotation = converted(o.view.map_or(camera.rotation, |view| view * camera.rotation));
-            let by_camera: Slope = projection_slope(camera, o.view, point) * unit;
-            let by_point: PointSlope = slope_in_camera(p) * rotation * unit;
-            let by_focal = SVector::<f64, 2>::new(p.x / p.z, p.y / p.z) * unit;
+            let by_camera: Slope = bent * projection_slope(camera, o.view, point) * unit;
+            let by_point: PointSlope = bent * slope_in_camera(p) * rotation * unit;
+            let by_focal = bent * SVector::<f64, 2>::new(p.x / p.z, p.y / p.z) * unit;
+            let by_bend = SVector::<f64, 2>::new(by_bend.x, by_bend.y) / o.deviation;
+            let by_lens =
+                SMatrix::<f64, 2, LENS>::from_columns(&[by_focal * free[0], by_bend * free[1]]);
             let r = SVector::<f64, 2>::new(r.x, r.y);
             own[o.point] += by_point.transpose() * by_point * weight;
             own_gradient[o.point] += by_point.transpose() * r * weight;
-            if self.prior.is_some() {
-                focal[o.point] += by_point.transpose() * by_focal * weight;
-                matrix[(last, last)] += weight * by_focal.norm_squared();
-                gradient[last] += weight * by_focal.dot(&r);
-            }
+            lens[o.point] += by_point.transpose() * by_lens * weight;
+            let mut block = matrix.fixed_view_mut::<LENS, LENS>(lens_at, lens_at);
+            block += by_lens.transpose() * by_lens * weight;
+            let mut part = gradient.fixed_rows_mut::<LENS>(lens_at);
+            part += by_lens.transpose() * r * weight;
             if let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) {
                 *mixed = by_camera.transpose() * by_point * weight;
                 let mut block = matrix.fixed_view_mut::<6, 6>(at, at);
                 block += by_camera.transpose() * by_camera * weight;
                 let mut part = gradient.fixed_rows_mut::<6>(at);
                 part += by_camera.transpose() * r * weight;
-                if self.prior.is_some() {
-                    let cross = by_camera.transpose() * by_focal * weight;
-                    let mut column = matrix.fixed_view_mut::<6, 1>(at, last);
-                    column += cross;
-                    let mut row = matrix.fixed_view_mut::<1, 6>(last, at);
-                    row += cross.transpose();
-                }
+                let cross = by_camera.transpose() * by_lens * weight;
+                let mut column = matrix.fixed_view_mut::<6, LENS>(at, lens_at);
+                column += cross;
+                let mut row = matrix.fixed_view_mut::<LENS, 6>(lens_at, at);
+                row += cross.transpose();
             }
         }
+        let (focal_at, bend_at) = (lens_at, lens_at + 1);
         match self.prior {
-            None => matrix[(last, last)] = 1.0,
+            None => matrix[(focal_at, focal_at)] = 1.0,
             Some(p) => {
-                matrix[(last, last)] += p.deviation.powi(-2);
-                gradient[last] += p.distance(self.log_focal) / p.deviation;
+                matrix[(focal_at, focal_at)] += p.deviation.powi(-2);
+                gradient[focal_at] += p.distance(self.log_focal) / p.deviation;
+            }
+        }
+        match self.bend_prior {
+            None => matrix[(bend_at, bend_at)] = 1.0,
+            Some(deviation) => {
+                matrix[(bend_at, bend_at)] += deviation.powi(-2);
+                gradient[bend_at] += self.bend * deviation.powi(-2);
             }
         }
         (0..n).for_each(|i| matrix[(i, i)] *= 1.0 + damping);
@@ -183,32 +212,34 @@ impl Bundle {
                 (m.try_inverse().unwrap_or_else(SMatrix::zeros), g)
             })
             .collect();
-        let mut reduced = Reduced { matrix, gradient, points, mixed, focal };
+        let mut reduced = Reduced { matrix, gradient, points, mixed, lens };
         self.eliminate(&mut reduced);
         reduced
     }
 
     /// Subtracts what the points take up: S = U − W V⁻¹ Wᵀ.
     fn eliminate(&self, reduced: &mut Reduced) {
-        let last = self.unknowns() - 1;
-        let Reduced { matrix, gradient, points, mixed, focal } = reduced;
+        let lens_at = self.unknowns() - LENS;
+        let Reduced { matrix, gradient, points, mixed, lens } = reduced;
         let all = self.observations.iter().zip(mixed.iter()).collect::<Vec<_>>();
         for run in all.chunk_by(|a, b| a.0.point == b.0.point) {
             let index = run[0].0.point;
             let (inverse, own) = &points[index];
-            let f = focal[index];
-            let through = inverse * f;
-            matrix[(last, last)] -= f.dot(&through);
-            gradient[last] -= through.dot(own);
+            let lens = lens[index];
+            let through = inverse * lens;
+            let mut block = matrix.fixed_view_mut::<LENS, LENS>(lens_at, lens_at);
+            block -= lens.transpose() * through;
+            let mut part = gradient.fixed_rows_mut::<LENS>(lens_at);
+            part -= through.transpose() * own;
             for (o, w) in run {
                 let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) else { continue };
                 let left = *w * inverse;
                 let mut part = gradient.fixed_rows_mut::<6>(at);
                 part -= left * own;
                 let cross = *w * through;
-                let mut column = matrix.fixed_view_mut::<6, 1>(at, last);
+                let mut column = matrix.fixed_view_mut::<6, LENS>(at, lens_at);
                 column -= cross;
-                let mut row = matrix.fixed_view_mut::<1, 6>(last, at);
+                let mut row = matrix.fixed_view_mut::<LENS, 6>(lens_at, at);
                 row -= cross.transpose();
                 for (other, v) in run {
                     let Some(to) = other.camera.checked_sub(1).map(|c| c * POSE) else { continue };
@@ -219,16 +250,19 @@ impl Bundle {
         }
     }
 
-    /// The bundle after a step of cameras and focal length; the points follow.
+    /// The bundle after a step of cameras and lens; the points follow.
     fn moved(&self, reduced: &Reduced, step: &DVector<f64>) -> Self {
         let mut next = self.clone();
-        let last = self.unknowns() - 1;
+        let lens_at = self.unknowns() - LENS;
         for (i, camera) in next.cameras.iter_mut().enumerate().skip(1) {
             let at = (i - 1) * POSE;
             *camera = camera.moved(&step.as_slice()[at..at + POSE]);
         }
         if self.prior.is_some() {
-            next.log_focal += step[last];
+            next.log_focal += step[lens_at];
+        }
+        if self.bend_prior.is_some() {
+            next.bend += step[lens_at + 1];
         }
         let mut gradients: Vec<SVector<f64, 3>> = reduced.points.iter().map(|p| p.1).collect();
         for (o, w) in self.observations.iter().zip(&reduced.mixed) {
@@ -237,7 +271,7 @@ impl Bundle {
             }
         }
         for (i, point) in next.points.iter_mut().enumerate() {
-            let g = gradients[i] + reduced.focal[i] * step[last];
+            let g = gradients[i] + reduced.lens[i] * step.fixed_rows::<LENS>(lens_at);
             let move_by = -(reduced.points[i].0 * g);
             *point += DVec3::new(move_by[0], move_by[1], move_by[2]);
         }
@@ -245,8 +279,8 @@ impl Bundle {
     }
 
     /// Standard deviations at the solution: of each camera's position in units of the scene (the
-    /// scale is that of the given points), of each rotation, radians, and of the logarithm of the
-    /// focal length. The first camera has none. `None` where the system is singular.
+    /// scale is that of the given points), of each rotation, radians, of the logarithm of the focal
+    /// length, and of the bend. The first camera has none. `None` where the system is singular.
     pub(super) fn deviations(&self) -> Option<Deviations> {
         let mut reduced = self.reduce(0.0);
         let n = self.unknowns();
@@ -271,8 +305,12 @@ impl Bundle {
                 .map(|i| if i == 0 { 0.0 } else { f64::sqrt(at(i, from)) })
                 .collect()
         };
-        let focal = if self.prior.is_some() { covariance[(n - 1, n - 1)].sqrt() } else { 0.0 };
-        Some(Deviations { rotations: all(0), translations: all(3), focal })
+        let of_lens = |at: usize, is_free: bool| {
+            if is_free { covariance[(n - LENS + at, n - LENS + at)].sqrt() } else { 0.0 }
+        };
+        let focal = of_lens(0, self.prior.is_some());
+        let bend = of_lens(1, self.bend_prior.is_some());
+        Some(Deviations { rotations: all(0), translations: all(3), focal, bend })
     }
 }
 
@@ -283,8 +321,10 @@ pub(super) struct Deviations {
     pub rotations: Vec<f64>,
     /// Of the translations, units of the scene.
     pub translations: Vec<f64>,
-    /// Of the logarithm of the focal length.
+    /// Of the logarithm of the focal length; 0 where it is kept.
     pub focal: f64,
+    /// Of the bend; 0 where it is kept.
+    pub bend: f64,
 }
 
 impl Reduced {
@@ -332,7 +372,16 @@ mod tests {
                 observations.push(Observation { camera, point, bearing, deviation, view });
             }
         }
-        Bundle { cameras, points, observations, log_focal: 0.0, prior: None }
+        let (log_focal, prior) = (0.0, None);
+        Bundle { cameras, points, observations, log_focal, prior, bend: 0.0, bend_prior: None }
+    }
+
+    /// The same pictures through a lens that bends.
+    fn bent(mut bundle: Bundle, k: f64) -> Bundle {
+        for o in &mut bundle.observations {
+            o.bearing = bend::bent(o.bearing, k).unwrap();
+        }
+        bundle
     }
 
     fn disturb(bundle: &mut Bundle) {
@@ -383,6 +432,7 @@ mod tests {
     fn the_gradient_is_that_of_finite_differences() {
         let mut bundle = scene(1.1, 0.5);
         bundle.prior = Some(FocalPrior { mean: 0.1, deviation: 0.3 });
+        (bundle.bend, bundle.bend_prior) = (-0.07, Some(0.2));
         disturb(&mut bundle);
         bundle.observations.truncate(200);
         let n = bundle.unknowns();
@@ -397,13 +447,16 @@ mod tests {
             }
         }
         for (i, (inverse, own)) in plain.points.iter().enumerate() {
-            plain.gradient[n - 1] += plain.focal[i].dot(&(inverse * own));
+            let mut part = plain.gradient.fixed_rows_mut::<LENS>(n - LENS);
+            part += plain.lens[i].transpose() * (inverse * own);
         }
         for i in 0..n {
             let at = |h: f64| {
                 let mut moved = kept.clone();
-                if i == n - 1 {
+                if i == n - LENS {
                     moved.log_focal += h;
+                } else if i == n - 1 {
+                    moved.bend += h;
                 } else {
                     let mut step = [0.0; POSE];
                     step[i % POSE] = h;
@@ -414,6 +467,25 @@ mod tests {
             let numeric = (at(1e-6) - at(-1e-6)) / 2e-6;
             let got = plain.gradient[i];
             assert!((numeric - got).abs() < 1e-3 * (1.0 + got.abs()), "{i}: {numeric} {got}");
+        }
+    }
+
+    #[test]
+    fn the_bend_of_a_lens_is_found_with_its_focal_length() {
+        for k in [-0.12, 0.04] {
+            let truth = bent(scene(1.1, 0.3), k);
+            let mut bundle = truth.clone();
+            bundle.prior = Some(FocalPrior { mean: 0.0, deviation: 0.3 });
+            disturb(&mut bundle);
+            let mut pinhole = bundle.clone();
+            pinhole.adjust(100);
+            bundle.bend_prior = Some(0.2);
+            bundle.adjust(100);
+            let deviations = bundle.deviations().unwrap();
+            assert!((bundle.bend - k).abs() < 4.0 * deviations.bend + 1e-3, "{}", bundle.bend);
+            assert!(deviations.bend > 1e-5 && deviations.bend < 0.02, "{deviations:?}");
+            let errors = [&bundle, &pinhole].map(|b| off(b, &truth));
+            assert!(errors[0] < 0.01 && errors[0] < 0.5 * errors[1], "{k}: {errors:?}");
         }
     }
 }

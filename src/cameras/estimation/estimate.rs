@@ -1,6 +1,7 @@
 //! The estimate for applications: from photographs to cameras, points and a confidence.
 
 use super::absolute::Absolute;
+use super::bend;
 use super::edges::{self, Edge};
 use super::groups;
 use super::pair::{self, PairEstimate};
@@ -24,6 +25,8 @@ pub struct PoseOptions {
     pub seed: u64,
     /// Treatment of photographs that do not determine their cameras.
     pub uncertain: Uncertain,
+    /// Whether lenses may bend straight lines ([`PoseEstimate::radial`]).
+    pub may_bend: bool,
 }
 
 /// Treatment of photographs that do not determine their cameras.
@@ -38,7 +41,7 @@ pub enum Uncertain {
 
 impl Default for PoseOptions {
     fn default() -> Self {
-        Self { seed: 0x5EED, uncertain: Uncertain::Refuse }
+        Self { seed: 0x5EED, uncertain: Uncertain::Refuse, may_bend: true }
     }
 }
 
@@ -47,6 +50,13 @@ impl PoseOptions {
     #[must_use]
     pub fn with_uncertain(mut self, uncertain: Uncertain) -> Self {
         self.uncertain = uncertain;
+        self
+    }
+
+    /// Sets [`PoseOptions::may_bend`].
+    #[must_use]
+    pub fn with_may_bend(mut self, may_bend: bool) -> Self {
+        self.may_bend = may_bend;
         self
     }
 }
@@ -67,6 +77,16 @@ pub struct FocalEstimate {
     pub scale: f64,
     /// Standard deviation of its logarithm: 0.03 means three percent. 0 where it was exact.
     pub deviation: f64,
+}
+
+/// A lens that bends straight lines: a position d of the picture, in focal lengths from its middle, shows the direction
+/// (d / (1 + k |d|²), 1). Source: A. Fitzgibbon 2001.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RadialLens {
+    /// k: negative for a barrel, positive for a pincushion.
+    pub k: f64,
+    /// Focal length of the picture's middle over that of the photographs' lenses.
+    pub focal_scale: f64,
 }
 
 /// A point that two or more photographs show.
@@ -107,6 +127,9 @@ pub struct PoseEstimate {
     pub left_out: Vec<LeftOut>,
     /// Focal length.
     pub focal: FocalEstimate,
+    /// The lens where three or more photographs show that it bends straight lines. Cameras and points are those of a
+    /// pinhole all the same: whoever reads this straightens the photographs and estimates their cameras again.
+    pub radial: Option<RadialLens>,
     /// Verdict on the whole.
     pub confidence: Confidence,
     /// Standard deviation of the least certain camera's rotation, degrees.
@@ -253,6 +276,7 @@ fn judged(
         focal_deviation: focal,
         rotation_deviation: rotation,
         position_deviation: direction,
+        bend: None,
     };
     let mut warnings: Vec<PoseWarning> = refusal.map(PoseWarning::Forced).into_iter().collect();
     if a.lens.deviation.max(b.lens.deviation) > STATED {
@@ -386,12 +410,23 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
     let prior = (deviation > 0.0).then_some(FocalPrior { mean: -first.ln(), deviation });
     let mut model =
         reconstruct::build(&exact, &usable, prior, options.seed).ok_or(PoseRefusal::NoPair)?;
+    let radial = options
+        .may_bend
+        .then(|| bend::of_photos(&exact, &usable, &model, prior, sound, options.seed))
+        .flatten()
+        .map(|bend| bend.seen_from(1.0 / first));
     model.focal_scale *= first;
     let placed: Vec<bool> = model.cameras.iter().map(Option::is_some).collect();
     let pairs: Vec<[usize; 2]> = usable.iter().map(|e| e.photos).collect();
     let left_out = groups::left_out(&placed, &pairs);
     let all: Vec<&PosePhoto> = photos.iter().collect();
-    Ok(finished(&all, model, left_out, Vec::new()))
+    let mut estimate = finished(&all, model, left_out, Vec::new());
+    // On the plane of the focal length that was found, as the definition says.
+    estimate.radial = radial.map(|bend| {
+        let focal_scale = bend.focal_scale;
+        RadialLens { k: bend.seen_from(focal_scale).k, focal_scale }
+    });
+    Ok(estimate)
 }
 
 /// Moves a model to the world frame and writes it out.
@@ -445,6 +480,7 @@ fn finished(
         points,
         left_out,
         focal: FocalEstimate { scale, deviation: model.focal_deviation },
+        radial: None,
         confidence: if warnings.is_empty() { Confidence::High } else { Confidence::Low },
         rotation_error_deg: model.rotation_deviation.to_degrees(),
         direction_error_deg: direction,

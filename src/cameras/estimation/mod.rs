@@ -6,7 +6,8 @@
 //!
 //! A panorama is a photograph of several views with one centre (`views.rs`).
 //!
-//! Features that stand still in the picture are left out (`still.rs`).
+//! Features that stand still in the picture are left out (`still.rs`). A lens that bends straight lines is found and
+//! said; the caller straightens the photographs (`bend.rs`).
 //!
 //! Cameras that are nearly right are adjusted by [`adjust_poses`] (`adjust.rs`).
 //!
@@ -18,6 +19,7 @@
 
 mod absolute;
 mod adjust;
+mod bend;
 mod bundle;
 mod edges;
 mod estimate;
@@ -37,8 +39,8 @@ mod world;
 
 pub use adjust::{CERTAIN_POINTS, PoseAdjustment, adjust_poses, locate_photos, move_along};
 pub use estimate::{
-    Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, Uncertain,
-    estimate_poses,
+    Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, RadialLens,
+    Uncertain, estimate_poses,
 };
 pub use photo::{Lens, PosePhoto, PosePhotoError};
 pub use reasons::{PoseRefusal, PoseWarning};

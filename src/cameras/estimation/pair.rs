@@ -130,6 +130,12 @@ pub(super) fn estimate(
     })
 }
 
+/// The pose that most of `points` support, with its support.
+pub(super) fn best(points: &[Bearings], prior: FocalPrior, seed: u64) -> Option<(f64, Refined)> {
+    let best = candidates(points, Some(prior), seed).into_iter().next()?;
+    Some((support(&best, points, Some(prior)), best))
+}
+
 /// A pose that was refined on its own matches below the pixel.
 struct Precise {
     refined: Refined,
@@ -255,9 +261,7 @@ fn along_lines(a: &PosePhoto, b: &PosePhoto, r: &Refined) -> Vec<Pair> {
     let e = r.relative.essential();
     let s = r.focal_scale;
     let deviation = 0.5 * (deviations(a)[0] + deviations(b)[0]);
-    let bearings = |i: usize, j: usize| {
-        Bearings { a: a.bearings[i], b: b.bearings[j], deviation, views: None }.rescaled(s)
-    };
+    let bearings = |i: usize, j: usize| bearings(a, b, i, j).rescaled(s);
     // Bearings belong to the lens's focal length, the line to the estimated one.
     let near = |i: usize| {
         let line = e * (a.bearings[i] / s).extend(1.0);

@@ -1,5 +1,6 @@
 //! A photograph for pose estimation: its features and what is known of its lens.
 
+use super::bend;
 use super::two_view::Bearings;
 use crate::cameras::matches::descriptors::DESCRIPTOR;
 use crate::cameras::matches::features;
@@ -92,7 +93,9 @@ pub struct PosePhoto {
     pub(super) lens: Lens,
     /// Lens in px of the working size.
     pub(super) working: Intrinsics,
-    /// Each feature on the plane z = 1, for the lens's own focal length.
+    /// Bend k of the lens, for its own focal length ([`bend`]).
+    pub(super) bend: f64,
+    /// Each feature on the plane z = 1, for the lens's own focal length, without the lens's bend.
     pub(super) bearings: Vec<DVec2>,
     /// Colour at each feature.
     pub(super) colours: Vec<[u8; 3]>,
@@ -163,10 +166,16 @@ impl PosePhoto {
         let features = features::detect(&image, count, orientation);
         let working = lens.intrinsics.resized(image.width(), image.height());
         let (bearings, colours, views) = (Vec::new(), Vec::new(), Vec::new());
-        let mut photo = Self { image, features, lens, working, bearings, colours, views };
-        let all = 0..photo.features.points.len();
-        photo.bearings = all.map(|i| photo.bearing(photo.position(i))).collect();
+        let mut photo =
+            Self { image, features, lens, working, bend: 0.0, bearings, colours, views };
+        photo.update_bearings();
         photo
+    }
+
+    /// Computes the bearings of all features.
+    pub(super) fn update_bearings(&mut self) {
+        let all = 0..self.features.points.len();
+        self.bearings = all.map(|i| self.bearing(self.position(i))).collect();
     }
 
     /// Samples the colour of each feature from the photograph.
@@ -222,9 +231,16 @@ impl PosePhoto {
             k.fy *= scale as f32;
         }
         photo.lens.deviation = 0.0;
-        let all = 0..photo.features.points.len();
-        photo.bearings = all.map(|i| photo.bearing(photo.position(i))).collect();
+        photo.bend *= scale * scale;
+        photo.update_bearings();
         photo
+    }
+
+    /// The same photograph with a lens that bends by `k` ([`bend`]).
+    pub(super) fn with_bend(mut self, k: f64) -> Self {
+        self.bend = k;
+        self.update_bearings();
+        self
     }
 
     /// The same photograph without the features that `left_out` marks.
@@ -254,8 +270,14 @@ impl PosePhoto {
         px * scale
     }
 
-    /// Point on the plane z = 1 of a position of the working picture, px.
+    /// Point on the plane z = 1 of a position of the working picture, px, without the lens's bend.
     pub(super) fn bearing(&self, px: DVec2) -> DVec2 {
+        let seen = self.seen(px);
+        if self.bend == 0.0 { seen } else { bend::straight(seen, self.bend) }
+    }
+
+    /// The same as the lens bends it.
+    fn seen(&self, px: DVec2) -> DVec2 {
         let k = &self.working;
         let start = DVec2::new((self.view_at(px) * k.width) as f64, 0.0);
         let centred = px - start - DVec2::new(f64::from(k.cx), f64::from(k.cy));
@@ -286,6 +308,18 @@ pub(super) fn deviations(photo: &PosePhoto) -> [f64; 2] {
     [FEATURE_DEVIATION, ALIGNED_DEVIATION].map(|d| d / photo.focal())
 }
 
+impl PosePhoto {
+    /// [`deviations`] of feature `i`, where the lens's bend was taken out.
+    pub(super) fn deviations_of(&self, i: usize) -> [f64; 2] {
+        let all = deviations(self);
+        if self.bend == 0.0 {
+            return all;
+        }
+        let seen = self.seen(self.position(i));
+        all.map(|d| d * bend::stretch(seen, self.bend))
+    }
+}
+
 /// Returns the matches of `found` as they were detected.
 pub(super) fn detected(a: &PosePhoto, b: &PosePhoto, found: &[Pair]) -> Vec<Bearings> {
     found.iter().map(|p| bearings(a, b, p.a, p.b)).collect()
@@ -293,7 +327,7 @@ pub(super) fn detected(a: &PosePhoto, b: &PosePhoto, found: &[Pair]) -> Vec<Bear
 
 /// The match of feature `i` of `a` with feature `j` of `b`, as they were detected.
 pub(super) fn bearings(a: &PosePhoto, b: &PosePhoto, i: usize, j: usize) -> Bearings {
-    let deviation = 0.5 * (deviations(a)[0] + deviations(b)[0]);
+    let deviation = 0.5 * (a.deviations_of(i)[0] + b.deviations_of(j)[0]);
     let (of_a, of_b) = (a.view_of(i), b.view_of(j));
     let turn = |view: Option<DMat3>| view.unwrap_or(DMat3::IDENTITY);
     let views = (of_a.is_some() || of_b.is_some()).then(|| [of_a, of_b].map(turn));
@@ -304,11 +338,10 @@ pub(super) fn bearings(a: &PosePhoto, b: &PosePhoto, i: usize, j: usize) -> Bear
 /// agree. Matches whose surroundings do not agree keep their place and a larger deviation.
 pub(super) fn aligned(a: &PosePhoto, b: &PosePhoto, found: &[Pair]) -> Vec<Bearings> {
     let mut matches = detected(a, b, found);
-    let precise = 0.5 * (deviations(a)[1] + deviations(b)[1]);
     matches.par_iter_mut().zip(found).for_each(|(m, p)| {
         if let Some(place) = aligned_position((a, p.a), (b, p.b)) {
             m.b = b.bearing(place);
-            m.deviation = precise;
+            m.deviation = 0.5 * (a.deviations_of(p.a)[1] + b.deviations_of(p.b)[1]);
         }
     });
     matches

@@ -56,6 +56,12 @@ pub enum PoseWarning {
         /// Share of the features, percent.
         percent: f64,
     },
+    /// The lens bends straight lines, but the straightened photographs have cameras for fewer of them.
+    #[error(
+        "the lens seems to bend straight lines, but photographs that were straightened fit together worse; straighten \
+         them with another program, or give cameras with their distortion"
+    )]
+    BentLines,
     /// A refusal that [`Uncertain::Accept`](super::Uncertain::Accept) overrode.
     #[error("{0}")]
     Forced(PoseRefusal),

@@ -10,10 +10,11 @@
 //! J.-M. Frahm, "Structure-from-motion revisited", 2016.
 
 use super::absolute::{Absolute, Sight, in_view, locate};
+use super::bend::{self, Bend};
 use super::bundle::{Bundle, Observation};
 use super::edges::{Edge, edges_of};
 use super::groups::Groups;
-use super::photo::{PosePhoto, aligned_position, deviations};
+use super::photo::{PosePhoto, aligned_position};
 use super::refine::FocalPrior;
 use super::tracks::{FeatureId, tracks};
 use glam::{DMat3, DVec2, DVec3};
@@ -60,12 +61,19 @@ pub(super) struct Model {
     pub rotation_deviation: f64,
     /// Largest standard deviation of a camera's position over the extent of all.
     pub position_deviation: f64,
+    /// The lens, where the photographs have one that bends.
+    pub bend: Option<Bend>,
 }
 
 impl Model {
     /// Number of photographs with a pose.
-    fn placed(&self) -> usize {
+    pub(super) fn placed(&self) -> usize {
         self.cameras.iter().flatten().count()
+    }
+
+    /// Number of features that agree with the points.
+    pub(super) fn agreeing(&self) -> usize {
+        self.points.iter().map(|p| p.features.len()).sum()
     }
 }
 
@@ -283,7 +291,7 @@ impl<'a> Builder<'a> {
     fn sight(&self, track: usize, at: usize) -> (DVec2, f64) {
         let id = self.tracks[track][at];
         let photo = &self.photos[id.photo];
-        let [detected, aligned] = deviations(photo);
+        let [detected, aligned] = photo.deviations_of(id.feature);
         match self.precise[track][at] {
             Some(px) => (photo.bearing(px), aligned),
             None => (photo.bearings[id.feature], detected),
@@ -415,9 +423,28 @@ impl<'a> Builder<'a> {
             kept.push(track);
         }
         let cameras = photos.iter().filter_map(|&i| self.cameras[i]).collect();
+        let (log_focal, prior) = (self.log_focal, self.prior);
         let bundle =
-            Bundle { cameras, points, observations, log_focal: self.log_focal, prior: self.prior };
+            Bundle { cameras, points, observations, log_focal, prior, bend: 0.0, bend_prior: None };
         (bundle, photos, kept)
+    }
+
+    /// The lens, from one more adjustment of all cameras and points with a free bend; `None` for photographs without
+    /// a bend.
+    fn bend(&self) -> Option<Bend> {
+        let prior = self.prior?;
+        let first = self.photos.first().filter(|photo| photo.bend != 0.0)?;
+        let mut bundle = self.bundle().0;
+        for o in &mut bundle.observations {
+            o.bearing = bend::bent(o.bearing, first.bend)?;
+            o.deviation /= bend::stretch(o.bearing, first.bend);
+        }
+        let deviation = prior.deviation.max(bend::FOCAL_DEVIATION);
+        bundle.prior = Some(FocalPrior { deviation, ..prior });
+        (bundle.bend, bundle.bend_prior) = (first.bend, Some(bend::DEVIATION));
+        bundle.adjust(25);
+        let deviation = bundle.deviations()?.bend;
+        Some(Bend { k: bundle.bend, deviation, focal_scale: bundle.log_focal.exp() })
     }
 
     /// Moves the features of each point to where their surroundings agree with those of the feature
@@ -447,6 +474,7 @@ impl<'a> Builder<'a> {
     }
 
     fn finish(self) -> Model {
+        let bend = self.bend();
         let (bundle, photos, _) = self.bundle();
         let deviations = bundle.deviations();
         let eyes: Vec<DVec3> = bundle.cameras.iter().map(Absolute::position).collect();
@@ -472,6 +500,7 @@ impl<'a> Builder<'a> {
             focal_deviation: focal,
             rotation_deviation: rotation,
             position_deviation: position,
+            bend,
         }
     }
 }

@@ -82,9 +82,10 @@ impl PosePhoto {
         let none = PosePhotoError::Length { width: view.width, height: view.height, found: 0 };
         let image = GrayImage::side_by_side(&images).ok_or(none)?;
         let (lens, bearings) = (Lens::known(view), Vec::new());
-        let mut photo = Self { image, features, lens, working, bearings, colours, views: turns };
-        let all = 0..photo.features.points.len();
-        photo.bearings = all.map(|i| photo.bearing(photo.position(i))).collect();
+        let views = turns;
+        let mut photo =
+            Self { image, features, lens, working, bend: 0.0, bearings, colours, views };
+        photo.update_bearings();
         Ok(photo)
     }
 

@@ -70,7 +70,7 @@ pub(super) fn border(k: &Intrinsics) -> impl Iterator<Item = DVec2> {
 }
 
 /// The ray (x, y, 1) of a pixel position, without its z.
-pub(super) fn ray(k: &Intrinsics, px: DVec2) -> DVec2 {
+pub(crate) fn ray(k: &Intrinsics, px: DVec2) -> DVec2 {
     DVec2::new(
         (px.x - f64::from(k.cx)) / f64::from(k.fx),
         (px.y - f64::from(k.cy)) / f64::from(k.fy),

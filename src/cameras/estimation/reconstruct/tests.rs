@@ -1,5 +1,5 @@
 use super::super::pair::PairEstimate;
-use super::super::photo::Lens;
+use super::super::photo::{Lens, deviations};
 use super::super::refine::Refined;
 use super::super::two_view::{Bearings, Relative, rotation};
 use super::*;
@@ -44,6 +44,7 @@ fn photograph(points: &[DVec3], pose: &Absolute) -> PosePhoto {
         features,
         lens: Lens::known(intrinsics),
         working: intrinsics,
+        bend: 0.0,
         colours: vec![[0; 3]; bearings.len()],
         bearings,
         views: Vec::new(),

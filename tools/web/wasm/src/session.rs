@@ -257,6 +257,10 @@ fn with_cameras(
     report("cameras", 0.0);
     let options = EstimateOptions { lens, ..EstimateOptions::default() };
     let found = estimate_cameras(photographs, &options).map_err(|error| error.to_string())?;
+    if found.straightened.is_some() {
+        warnings
+            .push("the lens bends straight lines: the photographs were straightened".to_owned());
+    }
     let estimate = &found.estimate;
     warnings.extend(estimate.left_out_sentences(|photo| names[photo].clone()));
     warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));

@@ -24,7 +24,9 @@ pub(super) const LENS_HELP: [&str; 2] = [
     "Lens of the photographs: pinhole, panorama, or `fisheye[:DEG][:CURVE]`.\n\n\
      By default a picture is a panorama where the file says so, or where it is twice as wide as high and its \
      left and right edges continue each other; else a photograph. Six views of 90 degrees are made of a \
-     panorama, one of at most 90 degrees of a fisheye picture. DEG: angle across the circle (180). CURVE: \
+     panorama, one of at most 90 degrees of a fisheye picture. Three or more photographs show whether their \
+     lens bends straight lines, as those of action cameras do, and are then straightened; pinhole reads them \
+     as they are. DEG: angle across the circle (180). CURVE: \
      equidistant (the default), equisolid or stereographic.",
 ];
 

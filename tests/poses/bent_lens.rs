@@ -1,0 +1,171 @@
+//! Cameras of photographs whose lens bends straight lines, which a ray caster draws (`box_room`).
+
+use glam::{DMat3, DVec2, DVec3, Mat4};
+use subsplat::cameras::estimation::Confidence;
+use subsplat::kernels::camera::{Camera, Intrinsics};
+use subsplat::reconstruct::{EstimatedPhotos, Projection};
+use subsplat::{
+    EstimateOptions, EstimatedScene, LoadOptions, Photograph, Rgb, estimate_cameras,
+    estimate_cameras_of_files, load_photograph, save_png,
+};
+use subsplat_test_support::box_room::{colour, picture};
+use subsplat_test_support::pose_errors::relative_errors;
+
+const SIZE: [usize; 2] = [800, 600];
+/// Focal length of the middle of the pictures, px: 83 degrees wide as a pinhole.
+const FOCAL: f64 = 450.0;
+
+/// A lens: the ray of a position, focal lengths from the middle.
+type Ray = fn(DVec2) -> DVec3;
+
+fn pinhole(at: DVec2) -> DVec3 {
+    at.extend(1.0)
+}
+
+fn barrel(at: DVec2) -> DVec3 {
+    at.extend(1.0 - 0.15 * at.length_squared())
+}
+
+/// A fisheye lens without a circle: 127 degrees across the diagonal.
+fn full_frame_fisheye(at: DVec2) -> DVec3 {
+    let theta = at.length();
+    (at.normalize_or_zero() * theta.sin()).extend(theta.cos())
+}
+
+/// Axes and positions of four photographs of one corner.
+fn places() -> [(DMat3, DVec3); 4] {
+    let axes = |yaw: f64, pitch: f64| DMat3::from_rotation_y(yaw) * DMat3::from_rotation_x(pitch);
+    [
+        (axes(0.30, 0.02), DVec3::new(-0.6, 0.1, -0.5)),
+        (axes(0.38, -0.03), DVec3::new(-0.2, 0.0, -0.6)),
+        (axes(0.22, 0.01), DVec3::new(0.2, 0.12, -0.4)),
+        (axes(0.15, 0.04), DVec3::new(0.5, -0.05, -0.7)),
+    ]
+}
+
+fn photographs(ray: Ray) -> Vec<Rgb> {
+    let middle = DVec2::new(SIZE[0] as f64, SIZE[1] as f64) * 0.5;
+    let one = |(axes, from): (DMat3, DVec3)| {
+        picture(SIZE, from, |px| Some(axes * ray((px - middle) / FOCAL)))
+    };
+    places().map(one).to_vec()
+}
+
+fn estimated(pictures: &[Rgb], projection: Projection) -> EstimatedScene {
+    let folder = tempfile::tempdir().unwrap();
+    let files: Vec<_> = (0..pictures.len())
+        .map(|i| {
+            let file = folder.path().join(format!("{i}.png"));
+            save_png(&file, &pictures[i]).unwrap();
+            file
+        })
+        .collect();
+    let options = EstimateOptions { projection, ..EstimateOptions::default() };
+    let found =
+        estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
+    let first = found.scene.frames[0].camera.rotation().as_dmat3();
+    for (frame, (axes, from)) in found.scene.frames.iter().zip(places()) {
+        if found.straightened.is_some() {
+            let (picture, camera) = frame.load().unwrap();
+            check_picture(&picture, &camera, (axes, from), places()[0].0 * first.transpose());
+        }
+    }
+    found
+}
+
+/// The picture shows what a pinhole at its place sees with the estimated rotation.
+fn check_picture(picture: &Rgb, camera: &Camera, place: (DMat3, DVec3), room_from_world: DMat3) {
+    let k = camera.intrinsics();
+    let axes = room_from_world * camera.rotation().as_dmat3();
+    let off = |p: usize| {
+        let px = DVec2::new((p % k.width) as f64 + 0.5, (p / k.width) as f64 + 0.5);
+        let at = px - DVec2::new(k.cx.into(), k.cy.into());
+        let seen = colour(place.1, axes * (at / f64::from(k.fx)).extend(1.0));
+        let pixel = &picture.data[3 * p..3 * p + 3];
+        pixel.iter().zip(seen).map(|(a, b)| f64::from(a.abs_diff(b))).sum::<f64>() / 3.0
+    };
+    let all: Vec<f64> = (0..k.width * k.height).step_by(7).map(off).collect();
+    let mean = all.iter().sum::<f64>() / all.len() as f64;
+    assert!(mean < 8.0, "{mean}");
+}
+
+/// Largest errors of rotations and directions against the first camera, degrees.
+fn errors(cameras: &[Option<Camera>]) -> [f64; 2] {
+    let truth = |i: usize, k: Intrinsics| {
+        let (axes, position) = places()[i];
+        let pose = Mat4::from_mat3_translation(axes.as_mat3(), position.as_vec3());
+        Camera::new(k, pose).unwrap()
+    };
+    let cameras: Vec<Camera> = cameras.iter().map(|camera| camera.unwrap()).collect();
+    let of = |i: usize| {
+        let truth = [0, i].map(|i| truth(i, cameras[i].intrinsics()));
+        relative_errors([&cameras[0], &cameras[i]], truth.each_ref())
+    };
+    let largest = |a: [f64; 2], b: [f64; 2]| [a[0].max(b[0]), a[1].max(b[1])];
+    (1..cameras.len()).map(of).fold([0.0; 2], largest)
+}
+
+#[test]
+fn photographs_of_a_lens_that_bends_are_straightened() {
+    for ray in [barrel, full_frame_fisheye] {
+        let pictures = photographs(ray);
+        let found = estimated(&pictures, Projection::Detected);
+        let lens = found.straightened.unwrap();
+        assert!(lens.k < -0.05, "{lens:?}");
+        let right = errors(&found.estimate.cameras);
+        assert!(right[0] < 0.3 && right[1] < 1.5, "{right:?}");
+        assert_eq!(found.estimate.confidence, Confidence::High, "{:?}", found.estimate.warnings);
+        let said = |w: &&String| w.contains("4 of 4 photographs: the lens bends straight lines");
+        assert_eq!(
+            found.scene.warnings.iter().filter(said).count(),
+            1,
+            "{:?}",
+            found.scene.warnings
+        );
+        // Points lie where the straight frames show them.
+        let mut distances: Vec<f32> = Vec::new();
+        for (point, seen) in found.estimate.points.iter().zip(&found.observations) {
+            for (frame, px) in seen {
+                let at = found.scene.frames[*frame].camera.project(point.position).unwrap();
+                distances.push(at.distance((*px).into()));
+            }
+        }
+        distances.sort_by(f32::total_cmp);
+        assert!(distances[distances.len() / 2] < 0.5, "{}", distances[distances.len() / 2]);
+        let as_pinholes = estimated(&pictures, Projection::Pinhole);
+        assert_eq!(as_pinholes.straightened, None);
+        let wrong = errors(&as_pinholes.estimate.cameras);
+        assert!(wrong[0] > 2.0 * right[0] && wrong[1] > 2.0 * right[1], "{wrong:?} {right:?}");
+    }
+}
+
+#[test]
+fn photographs_in_memory_are_straightened_alike() {
+    let folder = tempfile::tempdir().unwrap();
+    let pictures = photographs(barrel);
+    let of_files = estimated(&pictures, Projection::Detected);
+    let photographs: Vec<Photograph> = pictures
+        .iter()
+        .map(|picture| {
+            let file = folder.path().join("a.png");
+            save_png(&file, picture).unwrap();
+            load_photograph(&file, &LoadOptions::default()).unwrap()
+        })
+        .collect();
+    let found: EstimatedPhotos =
+        estimate_cameras(photographs, &EstimateOptions::default()).unwrap();
+    assert_eq!(found.straightened, of_files.straightened);
+    assert_eq!(found.estimate, of_files.estimate);
+    for (photo, frame) in found.photos.iter().zip(&of_files.scene.frames) {
+        assert_eq!((photo.image(), photo.camera()), (&frame.load().unwrap().0, frame.camera));
+    }
+}
+
+#[test]
+fn photographs_of_a_pinhole_stay_as_they_are() {
+    let found = estimated(&photographs(pinhole), Projection::Detected);
+    assert_eq!(found.straightened, None);
+    assert!(found.scene.frames.iter().all(|frame| frame.cut.is_none()));
+    let errors = errors(&found.estimate.cameras);
+    assert!(errors[0] < 0.3 && errors[1] < 1.5, "{errors:?}");
+}
