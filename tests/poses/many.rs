@@ -1,6 +1,8 @@
-//! Twenty photographs in any order, and one among them that does not belong.
+//! Three and more photographs: in any order, one that does not belong, lenses of which nothing is known.
 
-use subsplat::cameras::estimation::{Confidence, PoseOptions, PosePhoto, estimate_poses};
+use subsplat::cameras::estimation::{
+    Confidence, PoseEstimate, PoseOptions, PosePhoto, PoseWarning, estimate_poses,
+};
 use subsplat_kernels::camera::Camera;
 use subsplat_test_support::pose_errors::aligned_errors;
 use subsplat_test_support::posed_photos::{Intrinsics, MANY_FEATURES, PosedPhoto, photo_scene};
@@ -55,4 +57,38 @@ fn a_photograph_of_another_scene_is_named_and_left_out() {
         estimate.cameras.iter().map(Option::is_some).collect::<Vec<_>>(),
         [true, false, true, true, true]
     );
+}
+
+/// The estimate of photographs of a scene with lenses of which nothing is known, and their true cameras.
+fn with_unknown_lens(scene: &str, frames: &[usize]) -> Option<(PoseEstimate, Vec<Camera>)> {
+    let scene = photo_scene(scene)?;
+    let photos: Vec<PosedPhoto> = frames.iter().map(|&i| PosedPhoto::load(&scene, i)).collect();
+    let features: Vec<PosePhoto> =
+        photos.iter().map(|p| p.features(Intrinsics::Unknown, MANY_FEATURES)).collect();
+    let estimate = estimate_poses(&features, &PoseOptions::default()).unwrap();
+    Some((estimate, photos.iter().map(|p| p.camera).collect()))
+}
+
+#[test]
+fn pairs_tell_the_focal_length_together() {
+    // One pair alone votes for half of the focal length, which puts the cameras 33 degrees off.
+    for frames in [vec![0, 7, 14], vec![2, 7, 12, 17]] {
+        let Some((estimate, truth)) = with_unknown_lens("fox", &frames) else { return };
+        assert_eq!(estimate.confidence, Confidence::High, "{:?}", estimate.warnings);
+        let found: Vec<Camera> = estimate.cameras.iter().map(|c| c.unwrap()).collect();
+        let scale = found[0].intrinsics().fx / truth[0].intrinsics().fx;
+        assert!((scale - 1.0).abs() < 0.05, "{frames:?}: {scale}");
+        let errors = aligned_errors(&found, &truth);
+        assert!(errors.centre < 0.02 && errors.rotation_deg < 1.0, "{frames:?}: {errors:?}");
+    }
+}
+
+#[test]
+fn a_focal_length_that_the_photographs_do_not_tell_is_doubtful() {
+    // The camera hardly moves: focal lengths from 0.9 to 1.9 times the assumed one explain the points alike.
+    let frames: Vec<usize> = (4..14).collect();
+    let Some((estimate, _)) = with_unknown_lens("re10k_0c9b371cc6225682", &frames) else { return };
+    assert_eq!(estimate.confidence, Confidence::Low);
+    let is_focal = |w: &PoseWarning| matches!(w, PoseWarning::UncertainFocal { .. });
+    assert!(estimate.warnings.iter().any(is_focal), "{:?}", estimate.warnings);
 }

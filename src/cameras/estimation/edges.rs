@@ -1,7 +1,9 @@
 //! Pairs of photographs that are compared, and their relative poses.
 
 use super::pair::{self, PairEstimate};
-use super::photo::PosePhoto;
+use super::photo::{PosePhoto, detected};
+use super::refine::FocalPrior;
+use crate::cameras::matches::pairs::pairs;
 use rayon::prelude::*;
 
 /// Smallest number of matches of a verified pair.
@@ -32,10 +34,8 @@ fn compared(photos: &[PosePhoto]) -> Vec<[usize; 2]> {
         return all;
     }
     let sketches: Vec<_> = photos.par_iter().map(|p| p.features.strongest(SKETCH)).collect();
-    let alike: Vec<usize> = all
-        .par_iter()
-        .map(|&[i, j]| crate::cameras::matches::pairs::pairs(&sketches[i], &sketches[j]).len())
-        .collect();
+    let alike: Vec<usize> =
+        all.par_iter().map(|&[i, j]| pairs(&sketches[i], &sketches[j]).len()).collect();
     let mut chosen = vec![false; all.len()];
     for photo in 0..n {
         let mut own: Vec<usize> = (0..all.len()).filter(|&k| all[k].contains(&photo)).collect();
@@ -63,42 +63,59 @@ pub(super) fn edges_of(photos: &[PosePhoto], pairs: Vec<[usize; 2]>, seed: u64) 
         .collect()
 }
 
-/// Estimates the shared focal length of photographs whose lenses are not exact, over that of the
-/// lenses: the weighted median of the estimates of the pairs with most matches.
-pub(super) fn focal_scale(photos: &[PosePhoto], seed: u64) -> f64 {
+/// Ratio of neighbouring focal lengths that are tried.
+const FOCAL_STEP: f64 = 1.15;
+/// Largest number of matches of a pair by which focal lengths are compared.
+const MATCHES: usize = 600;
+/// Logarithm of the likelihood of one more match that agrees: half the squared limit of a residual would be
+/// 6, but residuals of neighbouring matches are alike.
+const LIKELIHOOD: f64 = 1.0;
+
+/// Estimates the shared focal length of photographs whose lenses are not exact, over that of the lenses: those that
+/// are tried are compared by the matches of the pairs with most of them, all together. A pair of photographs alone often
+/// supports a wrong one nearly as well. Mean and standard deviation of the logarithm.
+pub(super) fn focal_scale(photos: &[PosePhoto], deviation: f64, seed: u64) -> FocalPrior {
     /// Number of pairs that vote.
     const VOTES: usize = 8;
     let sketches: Vec<_> = photos.par_iter().map(|p| p.features.strongest(SKETCH)).collect();
     let mut alike: Vec<(usize, [usize; 2])> = compared(photos)
         .into_par_iter()
-        .map(|[i, j]| {
-            (crate::cameras::matches::pairs::pairs(&sketches[i], &sketches[j]).len(), [i, j])
-        })
+        .map(|[i, j]| (pairs(&sketches[i], &sketches[j]).len(), [i, j]))
         .collect();
     alike.sort_by_key(|(n, pair)| (std::cmp::Reverse(*n), *pair));
     // Neighbours of a video have many matches and little parallax: every second pair counts.
     let step = (alike.len() / (2 * VOTES)).clamp(1, 3);
-    let mut votes: Vec<(f64, f64)> = alike
-        .iter()
-        .step_by(step)
-        .take(VOTES)
-        .collect::<Vec<_>>()
-        .into_par_iter()
-        .filter_map(|(_, [i, j])| {
-            let e = pair::estimate(&photos[*i], &photos[*j], false, seed).ok()?;
-            let weight =
-                e.refined.information.lu().try_inverse().map_or(0.0, |c| 1.0 / c[(5, 5)].max(1e-6));
-            (e.consistent >= MIN_PAIR_INLIERS).then_some((e.refined.focal_scale, weight.sqrt()))
+    let chosen: Vec<[usize; 2]> =
+        alike.iter().step_by(step).take(VOTES).map(|(_, pair)| *pair).collect();
+    let tried: Vec<f64> = (-5..=6).map(|i| f64::from(i) * FOCAL_STEP.ln()).collect();
+    let kept = FocalPrior { mean: 0.0, deviation: 0.3 * FOCAL_STEP.ln() };
+    let votes: Vec<Vec<f64>> = chosen
+        .par_iter()
+        .map(|pair| {
+            let [a, b] = pair.map(|i| &photos[i]);
+            let found = pairs(&a.features, &b.features);
+            let step = found.len().div_ceil(MATCHES).max(1);
+            let found: Vec<_> = found.into_iter().step_by(step).collect();
+            let matches = detected(a, b, &found);
+            let of = |log_focal: &f64| {
+                let scaled: Vec<_> = matches.iter().map(|m| m.rescaled(log_focal.exp())).collect();
+                pair::best(&scaled, kept, seed).map_or(0.0, |(support, _)| support)
+            };
+            tried.iter().map(of).collect()
         })
         .collect();
-    votes.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let total: f64 = votes.iter().map(|v| v.1).sum();
-    let mut sum = 0.0;
-    votes
-        .iter()
-        .find(|v| {
-            sum += v.1;
-            sum >= 0.5 * total
-        })
-        .map_or(1.0, |v| v.0)
+    let log_likelihood = |i: usize| {
+        let support: f64 = votes.iter().map(|of_pair| of_pair[i]).sum();
+        LIKELIHOOD * support - 0.5 * (tried[i] / deviation).powi(2)
+    };
+    let all: Vec<f64> = (0..tried.len()).map(log_likelihood).collect();
+    let most = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let weights: Vec<f64> = all.iter().map(|l| (l - most).exp()).collect();
+    let total: f64 = weights.iter().sum();
+    let mean_of = |f: &dyn Fn(f64) -> f64| {
+        tried.iter().zip(&weights).map(|(x, w)| f(*x) * w).sum::<f64>() / total
+    };
+    let mean = mean_of(&|x| x);
+    let deviation = mean_of(&|x| (x - mean).powi(2)).sqrt();
+    FocalPrior { mean, deviation }
 }

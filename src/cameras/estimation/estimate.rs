@@ -75,7 +75,8 @@ pub enum Confidence {
 pub struct FocalEstimate {
     /// Focal length over that of the photographs' lenses; 1 where it was exact.
     pub scale: f64,
-    /// Standard deviation of its logarithm: 0.03 means three percent. 0 where it was exact.
+    /// Standard deviation of its logarithm: 0.03 means three percent. At least the distance to another focal length that
+    /// the points support nearly as well. 0 where it was exact.
     pub deviation: f64,
 }
 
@@ -166,6 +167,10 @@ const RIVAL: f64 = 0.85;
 const AMBIGUOUS: f64 = 0.985;
 /// Standard deviation of the focal length's logarithm above which the poses are not certain.
 const UNCERTAIN_FOCAL: f64 = 0.12;
+/// Features that agree with a model, over those of the best one, from which on it is another answer.
+const RIVAL_MODEL: f64 = 0.85;
+/// The same of what the matches of pairs tell, above which several focal lengths are tried.
+const TOLD: f64 = 0.15;
 /// Standard deviation of the focal length's logarithm above which a photograph's file did not state
 /// it.
 const STATED: f64 = 0.1;
@@ -401,15 +406,29 @@ fn median(mut values: Vec<f64>) -> f64 {
 /// Three and more photographs.
 fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, PoseRefusal> {
     let deviation = photos.iter().fold(0.0f64, |m, p| m.max(p.lens.deviation));
-    let first = if deviation > STATED { edges::focal_scale(photos, options.seed) } else { 1.0 };
-    let exact: Vec<PosePhoto> = photos.par_iter().map(|p| p.with_focal(first)).collect();
-    let edges = edges::edges(&exact, options.seed);
+    let starts = if deviation > STATED {
+        starts(edges::focal_scale(photos, deviation, options.seed))
+    } else {
+        vec![1.0]
+    };
     let accepted = options.uncertain == Uncertain::Accept;
+    let build = |first: f64| {
+        let exact: Vec<PosePhoto> = photos.par_iter().map(|p| p.with_focal(first)).collect();
+        let edges = edges::edges(&exact, options.seed);
+        let sound = |e: &Edge| accepted || refusal(&exact[e.photos[0]], &e.estimate).is_none();
+        let usable: Vec<Edge> = edges.into_iter().filter(sound).collect();
+        let prior = (deviation > 0.0).then_some(FocalPrior { mean: -first.ln(), deviation });
+        let model = reconstruct::build(&exact, &usable, prior, options.seed)?;
+        Some(Built { first, photos: exact, edges: usable, prior, model })
+    };
+    let mut built: Vec<Built> = starts.into_iter().filter_map(build).collect();
+    // A stable order: the first of equal ones.
+    built.sort_by_key(|b| std::cmp::Reverse((b.model.placed(), b.model.agreeing())));
+    let spread = spread(&built);
+    let best = built.into_iter().next().ok_or(PoseRefusal::NoPair)?;
+    let Built { first, photos: exact, edges: usable, prior, mut model } = best;
+    model.focal_deviation = model.focal_deviation.max(spread);
     let sound = |e: &Edge| accepted || refusal(&exact[e.photos[0]], &e.estimate).is_none();
-    let usable: Vec<Edge> = edges.into_iter().filter(sound).collect();
-    let prior = (deviation > 0.0).then_some(FocalPrior { mean: -first.ln(), deviation });
-    let mut model =
-        reconstruct::build(&exact, &usable, prior, options.seed).ok_or(PoseRefusal::NoPair)?;
     let radial = options
         .may_bend
         .then(|| bend::of_photos(&exact, &usable, &model, prior, sound, options.seed))
@@ -427,6 +446,40 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
         RadialLens { k: bend.seen_from(focal_scale).k, focal_scale }
     });
     Ok(estimate)
+}
+
+/// Cameras that were built with one focal length.
+struct Built {
+    /// Focal length at the start, over that of the lenses.
+    first: f64,
+    /// Photographs with that focal length.
+    photos: Vec<PosePhoto>,
+    /// Their pairs.
+    edges: Vec<Edge>,
+    /// Knowledge of the focal length over that at the start.
+    prior: Option<FocalPrior>,
+    /// The result.
+    model: Model,
+}
+
+/// Largest difference between the logarithms of the focal lengths of the first model and of those that the points
+/// support nearly as well.
+fn spread(built: &[Built]) -> f64 {
+    let Some(best) = built.first() else { return 0.0 };
+    let log_focal = |b: &Built| (b.first * b.model.focal_scale).ln();
+    let least = RIVAL_MODEL * best.model.agreeing() as f64;
+    let rivals = built.iter().filter(|b| b.model.agreeing() as f64 >= least);
+    rivals.map(|b| (log_focal(b) - log_focal(best)).abs()).fold(0.0, f64::max)
+}
+
+/// Focal lengths with which cameras are built, over those of the lenses: one where the matches tell it, else three of
+/// which the points decide.
+fn starts(found: FocalPrior) -> Vec<f64> {
+    let FocalPrior { mean, deviation } = found;
+    if deviation < TOLD {
+        return vec![mean.exp()];
+    }
+    [0.0, -1.0, 1.0].map(|side| (mean + side * 1.2 * deviation).exp()).to_vec()
 }
 
 /// Moves a model to the world frame and writes it out.

@@ -131,3 +131,35 @@ fn an_unknown_lens_that_comes_out_long_is_doubted() {
     // The file states it.
     assert_eq!(warnings(0.03, 2.0), None);
 }
+
+#[test]
+fn several_focal_lengths_are_tried_where_the_matches_do_not_tell_it() {
+    let found = |deviation| starts(FocalPrior { mean: 0.2, deviation });
+    assert_eq!(found(0.147), [0.2f64.exp()]);
+    let tried = found(0.153);
+    assert_eq!(tried.len(), 3);
+    assert!((tried[2] / tried[0] - (1.2f64 * 0.153).exp()).abs() < 1e-12, "{tried:?}");
+    assert!((tried[1] * tried[2] / tried[0].powi(2) - 1.0).abs() < 1e-12, "{tried:?}");
+}
+
+#[test]
+fn a_focal_length_is_as_uncertain_as_its_rival_is_far() {
+    let built = |first: f64, features: usize| {
+        let feature = |feature| FeatureId { photo: 0, feature };
+        let point = Point { position: DVec3::Z, features: (0..features).map(feature).collect() };
+        let model = Model {
+            cameras: Vec::new(),
+            points: vec![point],
+            focal_scale: 1.1,
+            focal_deviation: 0.01,
+            rotation_deviation: 0.0,
+            position_deviation: 0.0,
+            bend: None,
+        };
+        Built { first, photos: Vec::new(), edges: Vec::new(), prior: None, model }
+    };
+    let of = |rival: usize| spread(&[built(0.9, 1000), built(1.2, rival), built(1.0, 900)]);
+    assert!((of(833) - (1.0f64 / 0.9).ln()).abs() < 1e-12);
+    assert!((of(867) - (1.2f64 / 0.9).ln()).abs() < 1e-12);
+    assert_eq!([spread(&[]), spread(&[built(0.9, 10)])], [0.0, 0.0]);
+}

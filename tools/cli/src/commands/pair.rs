@@ -304,8 +304,7 @@ pub fn print_estimate(estimated: &EstimatedScene) {
             match estimate.focal.deviation {
                 0.0 => String::new(),
                 // A lens's distortion and its principal point can change it by far more.
-                d =>
-                    format!(", then adjusted to the points (±{:.1} % from their noise)", 100.0 * d),
+                d => format!(", then adjusted to the points (±{:.1} %)", 100.0 * d),
             }
         ));
     }
