@@ -157,6 +157,8 @@ const MIN_CONSISTENT: usize = 15;
 const MIN_SHARE: f64 = 0.2;
 /// Number of agreeing matches below which a pose is not certain.
 const FEW_CONSISTENT: usize = 45;
+/// Points of each of three and more photographs below which cameras of an unknown lens are not certain.
+const FEW_A_PHOTOGRAPH: usize = 40;
 /// Median shift of matched points below which two photographs are one view, px of 640 px.
 const SAME_VIEW_PX: f64 = 0.5;
 /// Median shift beside the best rotation below which the camera did not move, px of 640 px.
@@ -439,7 +441,9 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
     let pairs: Vec<[usize; 2]> = usable.iter().map(|e| e.photos).collect();
     let left_out = groups::left_out(&placed, &pairs);
     let all: Vec<&PosePhoto> = photos.iter().collect();
-    let mut estimate = finished(&all, model, left_out, Vec::new());
+    let few =
+        too_few(&model, deviation).then_some(PoseWarning::FewPoints { count: model.points.len() });
+    let mut estimate = finished(&all, model, left_out, few.into_iter().collect());
     // On the plane of the focal length that was found, as the definition says.
     estimate.radial = radial.map(|bend| {
         let focal_scale = bend.focal_scale;
@@ -470,6 +474,11 @@ fn spread(built: &[Built]) -> f64 {
     let least = RIVAL_MODEL * best.model.agreeing() as f64;
     let rivals = built.iter().filter(|b| b.model.agreeing() as f64 >= least);
     rivals.map(|b| (log_focal(b) - log_focal(best)).abs()).fold(0.0, f64::max)
+}
+
+/// Returns whether a model has too few points for lenses whose focal length has the standard deviation `deviation`.
+fn too_few(model: &Model, deviation: f64) -> bool {
+    deviation > STATED && model.points.len() < FEW_A_PHOTOGRAPH * model.placed()
 }
 
 /// Focal lengths with which cameras are built, over those of the lenses: one where the matches tell it, else three of

@@ -147,19 +147,31 @@ fn a_focal_length_is_as_uncertain_as_its_rival_is_far() {
     let built = |first: f64, features: usize| {
         let feature = |feature| FeatureId { photo: 0, feature };
         let point = Point { position: DVec3::Z, features: (0..features).map(feature).collect() };
-        let model = Model {
-            cameras: Vec::new(),
-            points: vec![point],
-            focal_scale: 1.1,
-            focal_deviation: 0.01,
-            rotation_deviation: 0.0,
-            position_deviation: 0.0,
-            bend: None,
-        };
+        let model = model(0, vec![point]);
         Built { first, photos: Vec::new(), edges: Vec::new(), prior: None, model }
     };
     let of = |rival: usize| spread(&[built(0.9, 1000), built(1.2, rival), built(1.0, 900)]);
     assert!((of(833) - (1.0f64 / 0.9).ln()).abs() < 1e-12);
     assert!((of(867) - (1.2f64 / 0.9).ln()).abs() < 1e-12);
     assert_eq!([spread(&[]), spread(&[built(0.9, 10)])], [0.0, 0.0]);
+}
+
+/// A model of `placed` photographs.
+fn model(placed: usize, points: Vec<Point>) -> Model {
+    Model {
+        cameras: vec![Some(Absolute::IDENTITY); placed],
+        points,
+        focal_scale: 1.1,
+        focal_deviation: 0.01,
+        rotation_deviation: 0.0,
+        position_deviation: 0.0,
+        bend: None,
+    }
+}
+
+#[test]
+fn few_points_do_not_tell_an_unknown_lens() {
+    let point = Point { position: DVec3::Z, features: Vec::new() };
+    let few = |points, deviation| too_few(&model(5, vec![point.clone(); points]), deviation);
+    assert_eq!([few(196, 0.35), few(204, 0.35), few(196, 0.098)], [true, false, false]);
 }
