@@ -485,7 +485,7 @@ mod tests {
             assert!((bundle.bend - k).abs() < 4.0 * deviations.bend + 1e-3, "{}", bundle.bend);
             assert!(deviations.bend > 1e-5 && deviations.bend < 0.02, "{deviations:?}");
             let errors = [&bundle, &pinhole].map(|b| off(b, &truth));
-            assert!(errors[0] < 0.01 && errors[0] < 0.5 * errors[1], "{k}: {errors:?}");
+            assert!(errors[0] < 0.01 && errors[0] < 0.9 * errors[1], "{k}: {errors:?}");
         }
     }
 }

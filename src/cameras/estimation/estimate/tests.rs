@@ -97,14 +97,8 @@ fn weak_pairs_have_warnings() {
 fn uncertain_cameras_have_warnings() {
     let a = photo(0.0);
     let warnings = |focal_deviation: f64, degrees: f64| {
-        let model = Model {
-            cameras: vec![Some(Absolute::IDENTITY); 2],
-            points: Vec::new(),
-            focal_scale: 1.0,
-            focal_deviation,
-            rotation_deviation: 0.0,
-            position_deviation: degrees.to_radians(),
-        };
+        let position_deviation = degrees.to_radians();
+        let model = Model { focal_deviation, position_deviation, ..model(2, Vec::new()) };
         finished(&[&a, &a], model, Vec::new(), Vec::new())
     };
     let certain = warnings(0.98 * 0.12, 0.98 * 1.5);
