@@ -1,14 +1,16 @@
 //! Cameras of photographs whose lens bends straight lines, which a ray caster draws (`box_room`).
 
-use glam::{DMat3, DVec2, DVec3, Mat4};
+use glam::{DMat3, DVec2, DVec3};
 use subsplat::cameras::estimation::Confidence;
-use subsplat::kernels::camera::{Camera, Intrinsics};
+use subsplat::kernels::camera::Camera;
 use subsplat::reconstruct::{EstimatedPhotos, Projection};
 use subsplat::{
     EstimateOptions, EstimatedScene, LoadOptions, Photograph, Rgb, estimate_cameras,
-    estimate_cameras_of_files, load_photograph, save_png,
+    estimate_cameras_of_files, load_photograph,
 };
-use subsplat_test_support::box_room::{colour, picture};
+use subsplat_test_support::box_room::{
+    camera_at, difference, median_reprojection, picture, save_pictures,
+};
 use subsplat_test_support::pose_errors::relative_errors;
 
 const SIZE: [usize; 2] = [800, 600];
@@ -54,13 +56,7 @@ fn photographs(ray: Ray) -> Vec<Rgb> {
 /// The estimate, and pictures and cameras of its frames.
 fn estimated(pictures: &[Rgb], projection: Projection) -> (EstimatedScene, Vec<(Rgb, Camera)>) {
     let folder = tempfile::tempdir().unwrap();
-    let files: Vec<_> = (0..pictures.len())
-        .map(|i| {
-            let file = folder.path().join(format!("{i}.png"));
-            save_png(&file, &pictures[i]).unwrap();
-            file
-        })
-        .collect();
+    let files = save_pictures(folder.path(), pictures);
     let options = EstimateOptions { projection, ..EstimateOptions::default() };
     let found =
         estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
@@ -68,32 +64,11 @@ fn estimated(pictures: &[Rgb], projection: Projection) -> (EstimatedScene, Vec<(
     (found, loaded)
 }
 
-/// The picture shows what a pinhole at its place sees with the estimated rotation.
-fn check_picture(picture: &Rgb, camera: &Camera, place: (DMat3, DVec3), room_from_world: DMat3) {
-    let k = camera.intrinsics();
-    let axes = room_from_world * camera.rotation().as_dmat3();
-    let off = |p: usize| {
-        let px = DVec2::new((p % k.width) as f64 + 0.5, (p / k.width) as f64 + 0.5);
-        let at = px - DVec2::new(k.cx.into(), k.cy.into());
-        let seen = colour(place.1, axes * (at / f64::from(k.fx)).extend(1.0));
-        let pixel = &picture.data[3 * p..3 * p + 3];
-        pixel.iter().zip(seen).map(|(a, b)| f64::from(a.abs_diff(b))).sum::<f64>() / 3.0
-    };
-    let all: Vec<f64> = (0..k.width * k.height).step_by(7).map(off).collect();
-    let mean = all.iter().sum::<f64>() / all.len() as f64;
-    assert!(mean < 8.0, "{mean}");
-}
-
 /// Largest errors of rotations and directions against the first camera, degrees.
 fn errors(cameras: &[Option<Camera>]) -> [f64; 2] {
-    let truth = |i: usize, k: Intrinsics| {
-        let (axes, position) = places()[i];
-        let pose = Mat4::from_mat3_translation(axes.as_mat3(), position.as_vec3());
-        Camera::new(k, pose).unwrap()
-    };
     let cameras: Vec<Camera> = cameras.iter().map(|camera| camera.unwrap()).collect();
     let of = |i: usize| {
-        let truth = [0, i].map(|i| truth(i, cameras[i].intrinsics()));
+        let truth = [0, i].map(|i| camera_at(places()[i], cameras[i].intrinsics()));
         relative_errors([&cameras[0], &cameras[i]], truth.each_ref())
     };
     let largest = |a: [f64; 2], b: [f64; 2]| [a[0].max(b[0]), a[1].max(b[1])];
@@ -108,7 +83,9 @@ fn photographs_of_a_lens_that_bends_are_straightened() {
         let first = found.scene.frames[0].camera.rotation().as_dmat3();
         let room_from_world = places()[0].0 * first.transpose();
         for ((picture, camera), place) in loaded.iter().zip(places()) {
-            check_picture(picture, camera, place, room_from_world);
+            let axes = room_from_world * camera.rotation().as_dmat3();
+            let off = difference(picture, &camera.intrinsics(), place.1, axes);
+            assert!(off < 8.0, "{off}");
         }
         let lens = found.straightened.unwrap();
         assert!(lens.k < -0.05, "{lens:?}");
@@ -123,15 +100,8 @@ fn photographs_of_a_lens_that_bends_are_straightened() {
             found.scene.warnings
         );
         // Points lie where the straight frames show them.
-        let mut distances: Vec<f32> = Vec::new();
-        for (point, seen) in found.estimate.points.iter().zip(&found.observations) {
-            for (frame, px) in seen {
-                let at = found.scene.frames[*frame].camera.project(point.position).unwrap();
-                distances.push(at.distance((*px).into()));
-            }
-        }
-        distances.sort_by(f32::total_cmp);
-        assert!(distances[distances.len() / 2] < 0.5, "{}", distances[distances.len() / 2]);
+        let error = median_reprojection(&found);
+        assert!(error < 0.5, "{error}");
         let (as_pinholes, _) = estimated(&pictures, Projection::Pinhole);
         assert_eq!(as_pinholes.straightened, None);
         let wrong = errors(&as_pinholes.estimate.cameras);
@@ -144,13 +114,9 @@ fn photographs_in_memory_are_straightened_alike() {
     let folder = tempfile::tempdir().unwrap();
     let pictures = photographs(barrel);
     let (of_files, loaded) = estimated(&pictures, Projection::Detected);
-    let photographs: Vec<Photograph> = pictures
+    let photographs: Vec<Photograph> = save_pictures(folder.path(), &pictures)
         .iter()
-        .map(|picture| {
-            let file = folder.path().join("a.png");
-            save_png(&file, picture).unwrap();
-            load_photograph(&file, &LoadOptions::default()).unwrap()
-        })
+        .map(|file| load_photograph(file, &LoadOptions::default()).unwrap())
         .collect();
     let found: EstimatedPhotos =
         estimate_cameras(photographs, &EstimateOptions::default()).unwrap();

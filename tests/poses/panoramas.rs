@@ -1,12 +1,13 @@
 //! Cameras of panoramas and of fisheye pictures, which a ray caster draws (`box_room`).
 
-use glam::{DMat3, DVec2, DVec3, Mat4};
-use std::path::PathBuf;
+use glam::{DMat3, DVec3};
 use subsplat::cameras::estimation::Confidence;
-use subsplat::kernels::camera::{Camera, Intrinsics};
+use subsplat::kernels::camera::Camera;
 use subsplat::reconstruct::{FisheyeCurve, FisheyeLens, LensSource, Projection};
 use subsplat::{EstimateOptions, EstimatedScene, Result, Rgb, estimate_cameras_of_files, save_png};
-use subsplat_test_support::box_room::{colour, fisheye, panorama};
+use subsplat_test_support::box_room::{
+    camera_at, colour, difference, fisheye, median_reprojection, panorama, save_pictures,
+};
 use subsplat_test_support::pose_errors::relative_errors;
 
 const WIDTH: usize = 1024;
@@ -24,20 +25,9 @@ fn places() -> [(DMat3, DVec3); 4] {
     ]
 }
 
-fn true_camera((axes, position): (DMat3, DVec3), k: Intrinsics) -> Camera {
-    let pose = Mat4::from_mat3_translation(axes.as_mat3(), position.as_vec3());
-    Camera::new(k, pose).unwrap()
-}
-
 fn estimated(pictures: &[Rgb], projection: Projection) -> Result<EstimatedScene> {
     let folder = tempfile::tempdir().unwrap();
-    let files: Vec<PathBuf> = (0..pictures.len())
-        .map(|i| {
-            let file = folder.path().join(format!("R{i}.png"));
-            save_png(&file, &pictures[i]).unwrap();
-            file
-        })
-        .collect();
+    let files = save_pictures(folder.path(), pictures);
     let options = EstimateOptions { projection, ..EstimateOptions::default() };
     let scene = estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(()))?;
     check_frames(&scene, pictures.len());
@@ -53,30 +43,15 @@ fn check_frames(found: &EstimatedScene, photographs: usize) {
     let room_from_world = places()[0].0 * first.transpose();
     for (i, frame) in frames.iter().enumerate() {
         let (picture, camera) = frame.load().unwrap();
-        let (from, k) = (places()[i / of_each].1, camera.intrinsics());
         let axes = room_from_world * camera.rotation().as_dmat3();
-        let (mut sum, mut count) = (0.0, 0.0);
-        for (p, pixel) in picture.data.chunks_exact(3).enumerate().step_by(7) {
-            let px = DVec2::new((p % k.width) as f64 + 0.5, (p / k.width) as f64 + 0.5);
-            let at = px - DVec2::new(k.cx.into(), k.cy.into());
-            let seen = colour(from, axes * (at / f64::from(k.fx)).extend(1.0));
-            sum += pixel.iter().zip(seen).map(|(a, b)| f64::from(a.abs_diff(b))).sum::<f64>() / 3.0;
-            count += 1.0;
-        }
-        assert!(sum / count < 6.0, "{}: {}", frame.name, sum / count);
-    }
-    let mut errors: Vec<f32> = Vec::new();
-    for (point, seen) in found.estimate.points.iter().zip(&found.observations) {
-        for (frame, px) in seen {
-            let at = frames[*frame].camera.project(point.position).unwrap();
-            errors.push(at.distance((*px).into()));
-        }
+        let off = difference(&picture, &camera.intrinsics(), places()[i / of_each].1, axes);
+        assert!(off < 6.0, "{}: {off}", frame.name);
     }
     // Views of a panorama leave out what lies above 41 degrees.
     let shared = found.observations.iter().filter(|seen| seen.len() >= 2).count();
     assert!(10 * shared > 8 * found.observations.len(), "{shared}");
-    errors.sort_by(f32::total_cmp);
-    assert!(errors[errors.len() / 2] < 0.5, "{}", errors[errors.len() / 2]);
+    let error = median_reprojection(found);
+    assert!(error < 0.5, "{error}");
     let visible: usize = frames.iter().map(|f| f.visible.len()).sum();
     assert_eq!(visible, found.observations.iter().map(Vec::len).sum::<usize>());
 }
@@ -85,7 +60,7 @@ fn check_cameras(found: &EstimatedScene, turn: f64, direction: f64) {
     assert_eq!(found.estimate.confidence, Confidence::High, "{:?}", found.estimate.warnings);
     let cameras: Vec<Camera> = found.estimate.cameras.iter().map(|c| c.unwrap()).collect();
     for (i, camera) in cameras.iter().enumerate().skip(1) {
-        let truth = [0, i].map(|i| true_camera(places()[i], camera.intrinsics()));
+        let truth = [0, i].map(|i| camera_at(places()[i], camera.intrinsics()));
         let errors = relative_errors([&cameras[0], camera], truth.each_ref());
         assert!(errors[0] < turn && errors[1] < direction, "{i}: {errors:?}");
     }
@@ -156,7 +131,7 @@ fn fisheye_pictures_are_cut_and_get_their_cameras() {
         let found =
             estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
         let cameras = [0, 1].map(|i| found.estimate.cameras[i].unwrap());
-        let truth = [0, 1].map(|i| true_camera(fisheye_place(i), cameras[i].intrinsics()));
+        let truth = [0, 1].map(|i| camera_at(fisheye_place(i), cameras[i].intrinsics()));
         let errors = relative_errors(cameras.each_ref(), truth.each_ref());
         assert!(errors[0] < 0.2 && errors[1] < 1.5, "{curve:?}: {errors:?}");
         assert_eq!(found.scene.frames[1].name, "b");

@@ -10,10 +10,10 @@
 
 use super::edges::Edge;
 use super::pair;
-use super::photo::{PosePhoto, detected};
+use super::photo::{PosePhoto, detected, deviations};
 use super::reconstruct::{self, Model};
 use super::refine::FocalPrior;
-use crate::cameras::matches::pairs::{self, Pair};
+use super::two_view::Bearings;
 use glam::{DMat2, DVec2};
 use rayon::prelude::*;
 use subsplat_kernels::camera::Intrinsics;
@@ -23,18 +23,16 @@ pub(super) const PHOTOGRAPHS: usize = 3;
 /// Standard deviation of the logarithm of the focal length while the lens bends: lenses state the focal length of their
 /// middle, or that of the whole angle.
 pub(super) const FOCAL_DEVIATION: f64 = 0.1;
-/// Knowledge of k: none bends its corners by more than two of them, for a focal length of three quarters of the
-/// longer side.
+/// Standard deviation of what is known of k before: a full-frame fisheye lens lies within two of them, because a
+/// stereographic one has −1/4 on the plane of its own focal length.
 pub(super) const DEVIATION: f64 = 0.2;
 /// Bends of the corners that are tried, over their distance from the middle.
 const TRIED: [f64; 2] = [-0.15, -0.05];
 /// Number of pairs on which they are tried.
 const VOTES: usize = 8;
-/// Largest number of matches of a pair.
-const MATCHES: usize = 600;
-/// Support of a lens that bends over that of a pinhole from which on cameras are built with it, and the number of matches
-/// by which it is larger. Pinholes' pictures give up to 1.009 and 4.
+/// Support of a lens that bends over that of a pinhole from which on cameras are built with it.
 const SUSPECT: f64 = 1.003;
+/// Matches that support it and no pinhole, from which on cameras are built with it. Pictures of pinholes gave up to 4.2.
 const SUSPECT_MATCHES: f64 = 6.0;
 /// Rounds of matching with a lens that bends.
 const ROUNDS: usize = 5;
@@ -42,8 +40,7 @@ const ROUNDS: usize = 5;
 const HOPEFUL: f64 = 0.9;
 /// Change of the corner between two rounds, over its distance from the middle, below which the lens is found.
 const SETTLED: f64 = 3e-3;
-/// Bend of the corners from which on a lens is no pinhole. Phones and cameras that correct their pictures leave up to
-/// 0.02.
+/// Bend of the corners from which on a lens is no pinhole. The photographs of `examples/berlin` came out at 0.023.
 const CLEAR: f64 = 0.03;
 /// Standard deviations of k from which on it is not 0.
 const CERTAIN: f64 = 8.0;
@@ -135,7 +132,8 @@ pub(super) fn of_photos(
     let mut bend = suspected(photos, edges, seed)?;
     let mut agreeing = 0;
     for _ in 0..ROUNDS {
-        let lens = |p: &PosePhoto| p.clone().with_bend(bend.k).with_focal(bend.focal_scale);
+        let k = bend.seen_from(bend.focal_scale).k;
+        let lens = |p: &PosePhoto| p.with_focal(bend.focal_scale).with_bend(k);
         let bent: Vec<PosePhoto> = photos.par_iter().map(lens).collect();
         let edges: Vec<Edge> =
             super::edges::edges(&bent, seed).into_iter().filter(&sound).collect();
@@ -155,6 +153,12 @@ pub(super) fn of_photos(
     (bend.is_clear(photos) && agreeing > model.agreeing()).then_some(bend)
 }
 
+/// A match of photographs whose features have the standard deviations `deviations`, without the lens's bend.
+fn straight_match(m: &Bearings, deviations: [f64; 2], k: f64) -> Bearings {
+    let deviation = 0.5 * (deviations[0] * stretch(m.a, k) + deviations[1] * stretch(m.b, k));
+    Bearings { a: straight(m.a, k), b: straight(m.b, k), deviation, views: m.views }
+}
+
 /// The lens that most matches of pairs support, where it is another one than a pinhole.
 fn suspected(photos: &[PosePhoto], edges: &[Edge], seed: u64) -> Option<Bend> {
     let mut best: Vec<&Edge> = edges.iter().collect();
@@ -168,12 +172,12 @@ fn suspected(photos: &[PosePhoto], edges: &[Edge], seed: u64) -> Option<Bend> {
         .par_iter()
         .map(|edge| {
             let [a, b] = edge.photos.map(|i| &photos[i]);
-            let found = pairs::pairs(&a.features, &b.features);
-            let step = found.len().div_ceil(MATCHES).max(1);
-            let found: Vec<Pair> = found.into_iter().step_by(step).collect();
+            let matches = detected(a, b, &pair::some_pairs(a, b));
+            let deviations = [a, b].map(|photo| deviations(photo)[0]);
             let of = |&k: &f64| {
-                let [a, b] = [a, b].map(|photo| photo.clone().with_bend(k));
-                pair::best(&detected(&a, &b, &found), prior, seed)
+                let straight: Vec<Bearings> =
+                    matches.iter().map(|m| straight_match(m, deviations, k)).collect();
+                pair::best(&straight, prior, seed)
                     .map_or((0.0, 0.0), |(support, refined)| (support, refined.focal_scale.ln()))
             };
             ks.iter().map(of).collect()

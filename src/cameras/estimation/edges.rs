@@ -65,8 +65,6 @@ pub(super) fn edges_of(photos: &[PosePhoto], pairs: Vec<[usize; 2]>, seed: u64) 
 
 /// Ratio of neighbouring focal lengths that are tried.
 const FOCAL_STEP: f64 = 1.15;
-/// Largest number of matches of a pair by which focal lengths are compared.
-const MATCHES: usize = 600;
 /// Logarithm of the likelihood of one more match that agrees: half the squared limit of a residual would be
 /// 6, but residuals of neighbouring matches are alike.
 const LIKELIHOOD: f64 = 1.0;
@@ -91,12 +89,9 @@ pub(super) fn focal_scale(photos: &[PosePhoto], deviation: f64, seed: u64) -> Fo
     let kept = FocalPrior { mean: 0.0, deviation: 0.3 * FOCAL_STEP.ln() };
     let votes: Vec<Vec<f64>> = chosen
         .par_iter()
-        .map(|pair| {
-            let [a, b] = pair.map(|i| &photos[i]);
-            let found = pairs(&a.features, &b.features);
-            let step = found.len().div_ceil(MATCHES).max(1);
-            let found: Vec<_> = found.into_iter().step_by(step).collect();
-            let matches = detected(a, b, &found);
+        .map(|photographs| {
+            let [a, b] = photographs.map(|i| &photos[i]);
+            let matches = detected(a, b, &pair::some_pairs(a, b));
             let of = |log_focal: &f64| {
                 let scaled: Vec<_> = matches.iter().map(|m| m.rescaled(log_focal.exp())).collect();
                 pair::best(&scaled, kept, seed).map_or(0.0, |(support, _)| support)

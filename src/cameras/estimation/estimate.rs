@@ -25,7 +25,7 @@ pub struct PoseOptions {
     pub seed: u64,
     /// Treatment of photographs that do not determine their cameras.
     pub uncertain: Uncertain,
-    /// Whether lenses may bend straight lines ([`PoseEstimate::radial`]).
+    /// Lenses may bend straight lines ([`PoseEstimate::radial`]).
     pub may_bend: bool,
 }
 
@@ -414,11 +414,13 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
         vec![1.0]
     };
     let accepted = options.uncertain == Uncertain::Accept;
+    let sound = |photos: &[PosePhoto], e: &Edge| {
+        accepted || refusal(&photos[e.photos[0]], &e.estimate).is_none()
+    };
     let build = |first: f64| {
         let exact: Vec<PosePhoto> = photos.par_iter().map(|p| p.with_focal(first)).collect();
         let edges = edges::edges(&exact, options.seed);
-        let sound = |e: &Edge| accepted || refusal(&exact[e.photos[0]], &e.estimate).is_none();
-        let usable: Vec<Edge> = edges.into_iter().filter(sound).collect();
+        let usable: Vec<Edge> = edges.into_iter().filter(|e| sound(&exact, e)).collect();
         let prior = (deviation > 0.0).then_some(FocalPrior { mean: -first.ln(), deviation });
         let model = reconstruct::build(&exact, &usable, prior, options.seed)?;
         Some(Built { first, photos: exact, edges: usable, prior, model })
@@ -430,7 +432,7 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
     let best = built.into_iter().next().ok_or(PoseRefusal::NoPair)?;
     let Built { first, photos: exact, edges: usable, prior, mut model } = best;
     model.focal_deviation = model.focal_deviation.max(spread);
-    let sound = |e: &Edge| accepted || refusal(&exact[e.photos[0]], &e.estimate).is_none();
+    let sound = |e: &Edge| sound(&exact, e);
     let radial = options
         .may_bend
         .then(|| bend::of_photos(&exact, &usable, &model, prior, sound, options.seed))

@@ -130,6 +130,16 @@ pub(super) fn estimate(
     })
 }
 
+/// Largest number of matches by which lenses are compared.
+const COMPARED_MATCHES: usize = 600;
+
+/// Matches of two photographs by which lenses are compared: of many some, at equal steps.
+pub(super) fn some_pairs(a: &PosePhoto, b: &PosePhoto) -> Vec<Pair> {
+    let found = pairs::pairs(&a.features, &b.features);
+    let step = found.len().div_ceil(COMPARED_MATCHES).max(1);
+    found.into_iter().step_by(step).collect()
+}
+
 /// The pose that most of `points` support, with its support.
 pub(super) fn best(points: &[Bearings], prior: FocalPrior, seed: u64) -> Option<(f64, Refined)> {
     let best = candidates(points, Some(prior), seed).into_iter().next()?;

@@ -1,8 +1,10 @@
 //! A box-shaped room with noise on its walls, which is seen in any direction: pictures of lenses of any kind.
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3, Mat4};
 use std::f64::consts::{PI, TAU};
-use subsplat::Rgb;
+use std::path::{Path, PathBuf};
+use subsplat::kernels::camera::{Camera, Intrinsics};
+use subsplat::{EstimatedScene, Rgb, save_png};
 
 /// Half of the room's sides; its middle is the origin, +y is down.
 const HALF: DVec3 = DVec3::new(2.0, 1.3, 2.6);
@@ -95,4 +97,46 @@ pub fn fisheye(
         let side = off.normalize_or_zero() * theta.sin();
         (r <= 1.0).then(|| world_from_camera * side.extend(theta.cos()))
     })
+}
+
+/// A camera in the room, of its axes and position.
+pub fn camera_at((axes, position): (DMat3, DVec3), k: Intrinsics) -> Camera {
+    let pose = Mat4::from_mat3_translation(axes.as_mat3(), position.as_vec3());
+    Camera::new(k, pose).unwrap()
+}
+
+/// Writes pictures to `folder` as R0.png, R1.png, … and returns the files.
+pub fn save_pictures(folder: &Path, pictures: &[Rgb]) -> Vec<PathBuf> {
+    let save = |(i, picture): (usize, &Rgb)| {
+        let file = folder.join(format!("R{i}.png"));
+        save_png(&file, picture).unwrap();
+        file
+    };
+    pictures.iter().enumerate().map(save).collect()
+}
+
+/// Mean difference, of 255, of a picture from what a pinhole `k` with these axes sees from `from`.
+pub fn difference(picture: &Rgb, k: &Intrinsics, from: DVec3, axes: DMat3) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for (p, pixel) in picture.data.chunks_exact(3).enumerate().step_by(7) {
+        let px = DVec2::new((p % k.width) as f64 + 0.5, (p / k.width) as f64 + 0.5);
+        let at = px - DVec2::new(k.cx.into(), k.cy.into());
+        let seen = colour(from, axes * (at / f64::from(k.fx)).extend(1.0));
+        sum += pixel.iter().zip(seen).map(|(a, b)| f64::from(a.abs_diff(b))).sum::<f64>() / 3.0;
+        count += 1.0;
+    }
+    sum / count
+}
+
+/// Median distance between points as their frames' cameras project them and where the frames show them, px.
+pub fn median_reprojection(found: &EstimatedScene) -> f32 {
+    let mut errors: Vec<f32> = Vec::new();
+    for (point, seen) in found.estimate.points.iter().zip(&found.observations) {
+        for (frame, px) in seen {
+            let at = found.scene.frames[*frame].camera.project(point.position).unwrap();
+            errors.push(at.distance((*px).into()));
+        }
+    }
+    errors.sort_by(f32::total_cmp);
+    errors[errors.len() / 2]
 }
