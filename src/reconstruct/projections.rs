@@ -8,7 +8,7 @@ use crate::cameras::estimation::{Lens, PhotoView, PoseEstimate, PosePhoto, PoseP
 use crate::files::Error as FileError;
 use crate::files::photos::distortion::Distortion;
 use crate::files::photos::photograph::{Photograph, load_photograph_or_panorama, panorama_shape};
-use crate::files::photos::shape::{ImageCircle, edges_meet, image_circle};
+use crate::files::photos::shape::{ImageCircle, edges_meet, has_two_circles, image_circle};
 use crate::files::photos::undistort;
 use crate::files::photos::views::{
     Cut, YAWS, fisheye_cut, has_panorama_shape, own_axes, panorama_cut, panorama_view, shared_axes,
@@ -114,11 +114,17 @@ pub(super) struct Prepared {
 /// Loads a photograph and detects at most `features` features.
 ///
 /// # Errors
-/// A photograph that cannot be read; a panorama or a fisheye picture that is none, by its shape.
+/// A photograph that cannot be read; a panorama or a fisheye picture that is none, by its shape; two fisheye pictures in
+/// one.
 pub(super) fn prepare(path: &Path, options: &EstimateOptions, features: usize) -> Result<Prepared> {
     let (mut photograph, stated) = load_photograph_or_panorama(path, &options.load)?;
     let mut warnings = std::mem::take(&mut photograph.warnings);
     let Rgb { width, height, .. } = photograph.image;
+    if options.projection == Projection::Detected && has_two_circles(&photograph.image) {
+        let got = "the two circles of a 360-degree camera's lenses, side by side (export panoramas with the camera's \
+                   program; --lens pinhole reads it as it is)";
+        return Err(FileError::format(path, "a photograph or a panorama", got).into());
+    }
     let panorama = match options.projection {
         Projection::Panorama => true,
         Projection::Pinhole | Projection::Fisheye(_) => false,

@@ -212,6 +212,7 @@ impl Reconstructor {
             warnings.push(Warning::UntrainedTensors { count: self.missing, upscale });
         }
         let bounds = guess.refined(options.depth_range, &reports);
+        warnings.extend(Warning::of_points(&bounds, &reports));
         let options = options.clone();
         Ok(Prepared {
             model: self,

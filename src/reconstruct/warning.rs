@@ -1,7 +1,7 @@
 //! Warnings of a reconstruction.
 
 use super::{DepthBounds, Photo};
-use crate::cameras::check::{Finding, PairReport};
+use crate::cameras::check::{Finding, PairReport, Verdict};
 use crate::reconstruct::inputs::crop::{CropOptions, Cropped};
 use std::collections::BTreeSet;
 use std::fmt;
@@ -31,6 +31,16 @@ pub enum Warning {
         near: f32,
         /// Farthest depth candidate, world units.
         far: f32,
+    },
+    /// Most points that the photographs share lie outside of the depth range.
+    #[non_exhaustive]
+    PointsOutsideRange {
+        /// Nearest depth candidate, world units.
+        near: f32,
+        /// Farthest depth candidate, world units.
+        far: f32,
+        /// Depths between which 96 % of the points of the first such pair lie, world units.
+        points: [f32; 2],
     },
     /// The input size was cut to multiples of the model's stride.
     #[non_exhaustive]
@@ -106,6 +116,11 @@ impl fmt::Display for Warning {
                 "the nearest and the farthest distance of the scene, {near:.4} and {far:.4}, are \
                  guessed from the distance between the cameras, so that shapes may be wrong; give \
                  --near and --far if you know them"
+            ),
+            Self::PointsOutsideRange { near, far, points: [low, high] } => write!(
+                f,
+                "most points that the photographs share are {low:.4} to {high:.4} away, outside of the range from \
+                 {near:.4} to {far:.4} in which distances are searched: shapes will be wrong; --near and --far set it"
             ),
             Self::InputSizeCut { requested, used, stride } => write!(
                 f,
@@ -231,6 +246,17 @@ impl Warning {
         warnings
     }
 
+    /// A warning where the median depth of the points of most pairs with some lies outside of `bounds`.
+    pub(super) fn of_points(bounds: &DepthBounds, reports: &[PairReport]) -> Option<Self> {
+        let DepthBounds { near, far, .. } = *bounds;
+        let usable = reports.iter().filter(|report| report.verdict != Verdict::Bad);
+        let depths: Vec<[f32; 5]> = usable.filter_map(|r| Some(r.depth?.quantiles)).collect();
+        let mut outside = depths.iter().filter(|[_, _, median, ..]| !(near..=far).contains(median));
+        let count = outside.clone().count();
+        let [low, .., high] = *outside.next().filter(|_| 2 * count > depths.len())?;
+        Some(Self::PointsOutsideRange { near, far, points: [low, high] })
+    }
+
     /// A warning where nothing but the baseline determined an end of `bounds`.
     pub(super) fn of_bounds(bounds: &DepthBounds) -> Option<Self> {
         let DepthBounds { near, far, source } = bounds;
@@ -264,7 +290,8 @@ fn of_pairs(warnings: &[Warning], finding: &Finding) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cameras::check::Verdict;
+    use crate::cameras::check::DepthReport;
+    use crate::reconstruct::DepthSource;
 
     #[test]
     fn equal_findings_of_many_pairs_are_one_sentence() {
@@ -290,6 +317,32 @@ mod tests {
         // Sentences without any difference need no number.
         let equal = [0, 1, 2].map(|first| pair(first, "same_photograph", 0));
         assert_eq!(Warning::sentences(&equal), ["same_photograph: 0 px"]);
+    }
+
+    #[test]
+    fn a_range_without_the_points_is_said() {
+        let report = |median: f32, verdict| PairReport {
+            depth: Some(DepthReport {
+                quantiles: [0.5 * median, 0.8 * median, median, 1.2 * median, 2.0 * median],
+                near: 0.4 * median,
+                far: 3.0 * median,
+                baseline_over_depth: 0.1,
+                parallax_px: 9.0,
+            }),
+            verdict,
+            ..PairReport::default()
+        };
+        let good = |median| report(median, Verdict::Ok);
+        let bounds = DepthBounds::new(20.0, 50.0, DepthSource::Fixed);
+        let of = |reports: &[PairReport]| Warning::of_points(&bounds, reports);
+        let found = of(&[good(3.0), good(4.0), good(30.0)]).unwrap();
+        let text = found.to_string();
+        assert!(text.contains("1.5000 to 6.0000 away") && text.contains("20.0000"), "{text}");
+        assert!(of(&[good(80.0)]).is_some());
+        for reports in [&[][..], &[good(20.0)], &[good(3.0), good(30.0)]] {
+            assert_eq!(of(reports), None);
+        }
+        assert_eq!(of(&[report(3.0, Verdict::Bad), PairReport::default()]), None);
     }
 
     #[test]

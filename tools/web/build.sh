@@ -17,7 +17,7 @@ cargo run --locked --release --quiet --manifest-path tools/web/bindgen/Cargo.tom
 mkdir -p "$out"
 # Servers like `python3 -m http.server` compress nothing; the page unpacks the file itself.
 gzip -9 -n -c "$places/web-bindgen/out/subsplat_bg.wasm" >"$out/subsplat.wasm.gz"
-files=(index.html page.css page.js scene.html viewer.css worker.js)
+files=(index.html page.css page.js scene.html video.js viewer.css worker.js)
 cp "${files[@]/#/tools/web/}" "$places/web-bindgen/out/subsplat_bg.js" "$out"
 cat tools/web/viewer/*.js >"$out/viewer.js"
 cd "$out"

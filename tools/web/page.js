@@ -117,10 +117,28 @@ function showChosen() {
   find("clear").hidden = photographs.length === 0;
 }
 
+/** `files` with frames in place of videos. */
+async function withFrames(files) {
+  running = new AbortController();
+  const { signal } = running;
+  busy(true);
+  try {
+    const all = [];
+    for (const file of files) {
+      find("stage").textContent = `choosing frames of ${file.name} …`;
+      const report = (fraction) => { find("progress").value = fraction; };
+      all.push(...(isVideo(file) ? await videoFrames(file, PHOTOGRAPHS_MAX, report, signal) : [file]));
+    }
+    return all;
+  } finally {
+    busy(false);
+  }
+}
+
 /** Takes files of a person; `taken`: of the device's camera, where more may follow. */
-function choose(list, taken = false) {
-  const files = [...list];
-  if (files.length === 0) return;
+async function choose(chosen, taken = false) {
+  if (chosen.length === 0) return;
+  const files = chosen.some(isVideo) ? await withFrames(chosen) : chosen;
   // A single file is added to the one before, so that a phone can give them one by one, its camera any number.
   const one = files.length === 1 && (photographs.length === 1 || taken);
   const together = one ? [...photographs, ...files] : files;
@@ -253,15 +271,13 @@ find("form").addEventListener("submit", (event) => {
   event.preventDefault();
   reconstruct();
 });
-find("files").addEventListener("change", () => {
-  choose(find("files").files);
-  // The same files can be chosen again.
-  find("files").value = "";
-});
-find("camera").addEventListener("change", () => {
-  choose(find("camera").files, true);
-  find("camera").value = "";
-});
+for (const id of ["files", "camera"]) {
+  find(id).addEventListener("change", () => {
+    attempt(() => choose([...find(id).files], id === "camera"));
+    // The same files can be chosen again.
+    find(id).value = "";
+  });
+}
 find("clear").addEventListener("click", () => {
   photographs = [];
   showChosen();
@@ -312,5 +328,7 @@ document.addEventListener("dragleave", (event) => {
 document.addEventListener("drop", (event) => {
   event.preventDefault();
   drop.classList.remove("over");
-  if (!find("files").disabled) choose(event.dataTransfer.files);
+  // The list is empty once the event is over.
+  const files = [...event.dataTransfer.files];
+  if (!find("files").disabled) attempt(() => choose(files));
 });

@@ -124,7 +124,8 @@ pub(super) fn of_photos(
     sound: impl Fn(&Edge) -> bool,
     seed: u64,
 ) -> Option<Bend> {
-    let prior = prior?;
+    // A focal length that is given is that of the middle or of the whole angle, as a stated one is.
+    let prior = prior.unwrap_or(FocalPrior { mean: 0.0, deviation: FOCAL_DEVIATION });
     let first = photos.first()?;
     if model.placed() < PHOTOGRAPHS || photos.iter().any(PosePhoto::has_views) {
         return None;

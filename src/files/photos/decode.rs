@@ -3,15 +3,17 @@
 //! Steps: detect the format by content, refuse truncated JPEG files and CMYK of unknown
 //! polarity, decode (`reduced.rs` beyond 100 megapixels, `converted.rs` what no decoder here reads), bring samples
 //! of 16 bits and of floating point to one range (`ranges.rs` has the rule), convert an embedded ICC profile to
-//! sRGB, make a mask of an alpha channel or blend transparency with black, round to 8 bits.
+//! sRGB, make a mask of an alpha channel or of black bars (`bars.rs`), or blend transparency with black, round to 8
+//! bits.
 //!
 //! A fourth band of a TIFF is an alpha by its `ExtraSamples`: 0 (unspecified) is none, 1 is one by which the colours are
 //! multiplied, 2 is one by which they are not. Without the tag it is read as 2, as OpenCV and others write it.
 
+use super::bars::bars;
 use super::image::{LoadOptions, MAX_PIXELS, Probe, Truncated};
 use super::programs::Kind;
 use super::tiff_tags::{EXTRA_SAMPLES, is_tiff, numbers};
-use super::{converted, heic, icc, jpeg, jxl, ranges, raw, reduced};
+use super::{converted, heic, icc, jpeg, jxl, pages, ranges, raw, reduced};
 use crate::files::{Error, Result, open_regular, read};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
@@ -205,6 +207,9 @@ pub(super) fn decode<'a>(
     };
     let Raster { mut pixels, profile, orientation, exif, panorama } = raster;
     let mut note = |line: &str| warnings.push(format!("{}: {line}", path.display()));
+    if let Some(line) = pages::note(tags) {
+        note(&line);
+    }
     if let Some(line) = fourth_band(&mut pixels, tags) {
         note(line);
     }
@@ -216,9 +221,12 @@ pub(super) fn decode<'a>(
     {
         note(&format!("the ICC profile is ignored and the colours are read as sRGB: {reason}"));
     }
-    let (picture, mask) = to_rgb(pixels);
+    let (picture, mut mask) = to_rgb(pixels);
     if mask.is_some() {
         note("the alpha channel is used as a mask: pixels with an alpha below 128 are left out");
+    } else if let Some((bars, line)) = bars(&picture).mask(picture.width, picture.height) {
+        note(&line);
+        mask = Some(bars);
     }
     Ok(Decoded { picture, mask, orientation, exif, panorama, warnings })
 }

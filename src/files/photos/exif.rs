@@ -18,7 +18,7 @@
 //! The longer side is compared with the longer one, because programs that rotate pixels often
 //! keep the two tags. Pixels are square, so the focal length holds for every orientation.
 
-use exif::{Exif, In, Rational, Tag, Value};
+use exif::{DateTime, Exif, In, Rational, Tag, Value};
 use std::fmt;
 
 /// Diagonal of 35 mm film, 36 × 24 mm.
@@ -88,11 +88,22 @@ pub struct ExifCamera {
     pub focal: Option<FocalLength>,
 }
 
+/// Time and exposure of a photograph, which tell a series of exposures of one view.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shot {
+    /// Local time of `DateTimeOriginal`, seconds since 1970.
+    pub seconds: f64,
+    /// `ExposureBiasValue`, stops above the measured exposure.
+    pub bias: f64,
+}
+
 /// Result of [`parse_exif`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ExifReport {
     /// The camera.
     pub camera: ExifCamera,
+    /// Time and exposure, where the block states both.
+    pub shot: Option<Shot>,
     /// Ignored values, one line each with tag and value.
     pub warnings: Vec<String>,
 }
@@ -118,6 +129,7 @@ pub fn parse_exif(block: &[u8], width: usize, height: usize) -> ExifReport {
     };
     report.camera.make = tags.text(Tag::Make);
     report.camera.model = tags.text(Tag::Model);
+    report.shot = tags.shot();
     let stored = tags.stored_size(width, height, &mut report.warnings);
     report.camera.focal = tags
         .film_35mm(&stored, &mut report.warnings)
@@ -145,6 +157,15 @@ impl StoredSize {
         }
         Err(format!("a field of view of {degrees:.1}° (accepted: {least}° to {greatest}°)"))
     }
+}
+
+/// Days from 1970-01-01 to a date of the Gregorian calendar. The year begins in March, so that a leap day is its last.
+fn days_before(year: i64, month: i64, day: i64) -> i64 {
+    let year = if month > 2 { year } else { year - 1 };
+    let of_year = (153 * ((month + 9) % 12) + 2) / 5 + day - 1;
+    // 719,468 days lie between 0000-03-01 and 1970-01-01.
+    365 * year + year.div_euclid(4) - year.div_euclid(100) + year.div_euclid(400) + of_year
+        - 719_468
 }
 
 struct Tags {
@@ -176,6 +197,16 @@ impl Tags {
             Value::Double(v) => v.first().copied(),
             other => other.get_uint(0).map(f64::from),
         }
+    }
+
+    fn shot(&self) -> Option<Shot> {
+        let bias = self.number(Tag::ExposureBiasValue).filter(|bias| bias.is_finite())?;
+        let Value::Ascii(lines) = self.value(Tag::DateTimeOriginal)? else { return None };
+        let time = DateTime::from_ascii(lines.first()?).ok()?;
+        let days = days_before(i64::from(time.year), i64::from(time.month), i64::from(time.day));
+        let [hours, minutes, seconds] = [time.hour, time.minute, time.second].map(i64::from);
+        let whole = ((24 * days + hours) * 60 + minutes) * 60 + seconds;
+        Some(Shot { seconds: whole as f64, bias })
     }
 
     /// Reads a number above 0. Other values are ignored with a warning.
@@ -287,6 +318,19 @@ impl Tags {
                 ));
                 1.0
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn days_follow_the_calendar() {
+        let dates = [(1970, 1, 1, 0), (1972, 2, 29, 789), (1972, 3, 1, 790), (2000, 1, 1, 10_957)];
+        for (year, month, day, days) in dates.into_iter().chain([(2026, 11, 30, 20_787)]) {
+            assert_eq!(days_before(year, month, day), days, "{year}-{month}-{day}");
         }
     }
 }

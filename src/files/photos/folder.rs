@@ -3,17 +3,13 @@
 
 use super::photograph::probe_photograph;
 use super::video::is_video;
-use super::{heic, jxl, masks, raw};
+use super::{heic, jxl, masks, raw, variants};
 use crate::files::poses::assemble::{files, has_extension};
 use crate::files::{Error, first_bytes, lower_extension};
-use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 /// Extensions of pictures beside the usual ones and the raw ones; some of the formats are not read.
 const OTHER_EXTENSIONS: [&str; 6] = ["gif", "exr", "hdr", "cr3", "raf", "insp"];
-/// Extensions of pictures that every program reads. Cameras and phones write another format beside one of them, and
-/// people convert to them: a file of the same name is the same photograph.
-const COMMON_EXTENSIONS: [&str; 7] = ["jpg", "jpeg", "jpe", "jfif", "png", "tif", "tiff"];
 /// Names of a line; the others are counted.
 const NAMES: usize = 3;
 /// Bytes that decide what a file is.
@@ -80,6 +76,7 @@ pub fn find_photographs(folder: impl AsRef<Path>) -> FolderPhotographs {
 
 fn in_folder(folder: &Path) -> FolderPhotographs {
     let mut found = FolderPhotographs { companions: companions(folder), ..Default::default() };
+    let mut pictures = Vec::new();
     for path in files(folder) {
         let moving = is_moving(&path);
         if !moving && !is_picture(&path) {
@@ -90,81 +87,20 @@ fn in_folder(folder: &Path) -> FolderPhotographs {
             "a video; give the video alone to use frames of it".to_owned()
         } else {
             match probe_photograph(&path) {
-                Ok(_) => {
-                    found.photographs.push(path);
+                Ok(header) => {
+                    pictures.push(variants::Found { path, header });
                     continue;
                 }
                 Err(Error::Format { got, .. }) => got,
                 Err(Error::Io { source, .. }) => source.to_string(),
             }
         };
-        found.left_out.push([name_of(&path), reason]);
+        found.left_out.push([variants::name_of(&path), reason]);
     }
-    leave_out_twins(&mut found);
-    leave_out_copies(&mut found);
+    let (photographs, left_out) = variants::sorted_out(pictures);
+    found.photographs = photographs;
+    found.left_out.extend(left_out);
     found
-}
-
-/// Name of a file without its folders.
-fn name_of(path: &Path) -> String {
-    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
-}
-
-/// Leaves out files that equal another one byte for byte, such as `a (1).jpg` beside `a.jpg`: they show one place. The
-/// one with the shortest name stays.
-fn leave_out_copies(found: &mut FolderPhotographs) {
-    let mut of_size: HashMap<u64, Vec<usize>> = HashMap::new();
-    for (i, path) in found.photographs.iter().enumerate() {
-        // A file without a size is an error of its reader.
-        if let Ok(metadata) = path.metadata() {
-            of_size.entry(metadata.len()).or_default().push(i);
-        }
-    }
-    let name = |i: usize| name_of(&found.photographs[i]);
-    let mut copies: Vec<(usize, String)> = Vec::new();
-    for mut same in of_size.into_values().filter(|same| same.len() > 1) {
-        same.sort_by_key(|&i| (name(i).len(), i));
-        let mut kept: Vec<(usize, Vec<u8>)> = Vec::new();
-        for i in same {
-            let Ok(bytes) = std::fs::read(&found.photographs[i]) else { continue };
-            match kept.iter().find(|(_, other)| *other == bytes) {
-                Some((first, _)) => copies.push((i, format!("a copy of {}", name(*first)))),
-                None => kept.push((i, bytes)),
-            }
-        }
-    }
-    copies.sort();
-    for (i, reason) in copies.iter().rev() {
-        let path = found.photographs.remove(*i);
-        found.left_out.push([name_of(&path), reason.clone()]);
-    }
-}
-
-/// Leaves out raw, HEIC, AVIF and JPEG XL files beside a JPEG, PNG or TIFF of the same name: two photographs from one
-/// place.
-fn leave_out_twins(found: &mut FolderPhotographs) {
-    let is_common = |path: &Path| COMMON_EXTENSIONS.contains(&lower_extension(path).as_str());
-    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
-    let common: HashSet<String> =
-        found.photographs.iter().filter(|path| is_common(path)).map(|path| stem(path)).collect();
-    let left_out = &mut found.left_out;
-    found.photographs.retain(|path| {
-        // Only formats of cameras and phones, not every other extension.
-        let is_twin =
-            !is_common(path) && has_format_of_its_own(path) && common.contains(&stem(path));
-        if is_twin {
-            left_out
-                .push([name_of(path), "a JPEG, PNG or TIFF of the same name is read".to_owned()]);
-        }
-        !is_twin
-    });
-}
-
-/// Returns whether an extension is one of HEIC, AVIF, JPEG XL or a raw format.
-fn has_format_of_its_own(path: &Path) -> bool {
-    let extension = lower_extension(path);
-    ["heic", "heif", "hif", "avif", "jxl", "cr3", "raf"].contains(&extension.as_str())
-        || raw::EXTENSIONS.contains(&extension.as_str())
 }
 
 /// Returns whether a file is a video. A GIF in a folder may be a still picture.
@@ -240,7 +176,7 @@ mod tests {
         let found = find_photographs(folder.path());
         assert_eq!(found.photographs, ["a.png", "b9.jfif", "b10.png", "c"].map(path));
         let copies = found.notes().into_iter().find(|note| note.contains("a copy of b10.png"));
-        assert!(copies.is_some_and(|n| n.contains("b10 (2).png, b10 (1).png")), "{found:?}");
+        assert!(copies.is_some_and(|n| n.contains("b10 (1).png, b10 (2).png")), "{found:?}");
         for extra in ["a.png", "b10 (1).png", "b10 (2).png"] {
             std::fs::remove_file(path(extra)).unwrap();
         }

@@ -2,7 +2,8 @@
 //!
 //! A pose file names them (nerfstudio's `mask_path`), or they lie in a folder `masks` beside the folder of the
 //! photographs, `images` or a reduced copy as `images_4`, or in it: `masks/NAME.jpg.png` (COLMAP) or
-//! `masks/NAME.png`. The folder may be called `mask` or `masks_2` too ([`FOLDERS`]). A mask belongs to the stored
+//! `masks/NAME.png`. The folder may be called `mask` or `masks_2` too ([`FOLDERS`]). Without one there, a mask lies
+//! beside its photograph: `NAME_mask.png` (`variants.rs`). A mask belongs to the stored
 //! pixels, as COLMAP and nerfstudio have it; one of the shape of the upright pixels alone belongs to those. A JPEG has
 //! noise, so its values below 128 are masked.
 //!
@@ -11,6 +12,7 @@
 use super::decode::decode;
 use super::image::{LoadOptions, Probe, probe};
 use super::jpeg;
+use super::variants;
 use crate::files::poses::assemble::find_image;
 use crate::files::{Error, Result, read};
 use crate::scene::mask::Mask;
@@ -28,8 +30,8 @@ const ASPECT: f64 = 0.02;
 /// Least value of a kept pixel in a lossless file, and in a JPEG.
 const KEPT: [u8; 2] = [1, 128];
 
-/// Mask file of a photograph by the names of the folders, whether it exists or not; `None` where there is no folder
-/// of masks.
+/// Mask file of a photograph by the names of the folders, whether it exists or not; that beside it, or `None`, where
+/// there is no folder of masks.
 pub(in crate::files) fn of_photograph(image: &Path) -> Option<PathBuf> {
     let absolute = std::path::absolute(image).unwrap_or_else(|_| image.to_owned());
     let own = absolute.parent()?;
@@ -50,12 +52,13 @@ pub(in crate::files) fn of_photograph(image: &Path) -> Option<PathBuf> {
         } else {
             find_image(&[&masks], &name.to_string_lossy()).filter(|path| path.is_file())
         };
+        let found = found.or_else(|| variants::mask_beside(image));
         if found.is_some() || whole {
             let colmap = format!("{}.png", name.to_string_lossy());
             return Some(found.unwrap_or_else(|| masks.join(colmap)));
         }
     }
-    None
+    variants::mask_beside(image)
 }
 
 /// Returns whether `folder` has the name of a folder of masks.
@@ -281,6 +284,14 @@ mod tests {
         let found = photograph(&at("images/c.jpg"));
         assert_eq!((found.mask, found.warnings.len()), (None, 1));
         assert!(found.warnings[0].contains("c.jpg.png"), "{:?}", found.warnings);
+        // One beside the photograph.
+        let beside = at("images/c_mask.png");
+        save_mask(&beside, [8, 6], grey);
+        assert_eq!(photograph(&at("images/c.jpg")).mask, Some(expected()));
+        fs::remove_file(beside).unwrap();
+        jpeg.save(at("images 2.jpg")).unwrap();
+        save_mask(&at("images 2-Mask.png"), [8, 6], grey);
+        assert_eq!(photograph(&at("images 2.jpg")).mask, Some(expected()));
         // So does another shape.
         save_mask(&at("masks/c.jpg.png"), [6, 8], |_, _| 0);
         let found = photograph(&at("images/c.jpg"));

@@ -1,5 +1,6 @@
 //! Photographs and pictures: decoding, metadata, lens distortion, sizes; frames of videos.
 
+mod bars;
 mod converted;
 mod decode;
 pub mod distortion;
@@ -13,6 +14,7 @@ mod jpeg;
 mod jxl;
 pub(in crate::files) mod masks;
 pub mod notes;
+mod pages;
 pub mod photograph;
 mod programs;
 mod ranges;
@@ -23,5 +25,6 @@ mod rgb_image;
 pub mod shape;
 mod tiff_tags;
 pub mod undistort;
+mod variants;
 pub mod video;
 pub mod views;

@@ -7,7 +7,7 @@
 //! ICC profiles are applied to both kinds of pictures: a wrong colour is wrong for every reader.
 
 use super::decode::{self, Header, decode};
-use super::exif::{ExifCamera, ExifReport, parse_exif};
+use super::exif::{ExifCamera, ExifReport, Shot, parse_exif};
 use super::image::{LoadOptions, Probe};
 use super::masks;
 use crate::files::poses::assemble::list_images;
@@ -47,6 +47,8 @@ pub struct PhotographHeader {
     pub orientation: Option<u8>,
     /// The camera of the EXIF block. Its focal length is in px of `width` × `height`.
     pub camera: ExifCamera,
+    /// Time and exposure in the EXIF block.
+    pub shot: Option<Shot>,
     /// The metadata state an equirectangular panorama, which has no focal length.
     pub panorama: bool,
     /// Warnings for the user, one line each, with the file's path.
@@ -113,14 +115,14 @@ pub fn probe_photograph(path: impl AsRef<Path>) -> Result<PhotographHeader> {
     let Header { probe, exif, panorama, warnings: mut notes } = decode::header(path)?;
     let orientation = probe.orientation;
     let Probe { width, height, .. } = probe.upright();
-    let ExifReport { mut camera, warnings, .. } = report(exif.as_deref(), width, height, path);
+    let ExifReport { mut camera, shot, warnings } = report(exif.as_deref(), width, height, path);
     notes.extend(warnings);
     if panorama {
         camera.focal = None;
     } else {
         notes.extend(panorama_shape(&camera, width, height, path));
     }
-    Ok(PhotographHeader { width, height, orientation, camera, panorama, warnings: notes })
+    Ok(PhotographHeader { width, height, orientation, camera, shot, panorama, warnings: notes })
 }
 
 /// Decodes a photograph with its mask and turns it upright. A mask file that is missing, cannot be read or has

@@ -126,6 +126,26 @@ pub fn image_circle(picture: &Rgb) -> Option<ImageCircle> {
     (sized && inside && enough).then_some(circle)
 }
 
+/// Returns whether a picture has the discs of two fisheye lenses beside or above each other, as 360° cameras store them.
+pub fn has_two_circles(picture: &Rgb) -> bool {
+    let Rgb { width, height, .. } = *picture;
+    let beside = width == 2 * height;
+    if !beside && height != 2 * width {
+        return false;
+    }
+    let side = width.min(height);
+    let half = |second: usize| {
+        let from = second * side;
+        let rows = if beside { 0..side } else { from..from + side };
+        let row = |y: usize| {
+            let start = 3 * (y * width + if beside { from } else { 0 });
+            &picture.data[start..start + 3 * side]
+        };
+        Rgb { width: side, height: side, data: rows.flat_map(row).copied().collect() }
+    };
+    [0, 1].into_iter().all(|second| image_circle(&half(second)).is_some())
+}
+
 fn near(circle: &ImageCircle, at: DVec2, share: f64) -> bool {
     let off = at.distance(DVec2::from(circle.centre)) - circle.radius;
     off.abs() <= share * circle.radius
@@ -189,4 +209,36 @@ fn fitted(points: &[DVec2]) -> Option<ImageCircle> {
     let radius = (solution.z + centre.length_squared()).sqrt();
     let circle = ImageCircle { centre: (mean + centre).to_array(), radius };
     (radius.is_finite() && radius > 0.0).then_some(circle)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Discs of `radius` px around `centres`, uneven, on black.
+    fn discs([width, height]: [usize; 2], centres: &[[f64; 2]], radius: f64) -> Rgb {
+        let value = |x: usize, y: usize| {
+            let at = DVec2::new(x as f64, y as f64);
+            let inside = centres.iter().any(|centre| at.distance(DVec2::from(*centre)) < radius);
+            if inside { 80 + ((13 * x + 7 * y) % 120) as u8 } else { ((x + y) % 4) as u8 }
+        };
+        let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        Rgb { width, height, data: pixels.flat_map(|(x, y)| [value(x, y); 3]).collect() }
+    }
+
+    #[test]
+    fn one_circle_and_two_are_told_apart() {
+        let one = discs([400, 300], &[[200.0, 150.0]], 140.0);
+        let circle = image_circle(&one).unwrap();
+        assert!((circle.radius - 140.0).abs() < 2.0, "{circle:?}");
+        assert!(!has_two_circles(&one));
+        let beside = discs([600, 300], &[[150.0, 148.0], [452.0, 150.0]], 140.0);
+        let above = discs([300, 600], &[[150.0, 148.0], [150.0, 452.0]], 140.0);
+        assert!(has_two_circles(&beside) && has_two_circles(&above));
+        // One disc, a picture of two to one without any, and another shape.
+        assert!(!has_two_circles(&discs([600, 300], &[[150.0, 150.0]], 140.0)));
+        assert!(!has_two_circles(&discs([600, 300], &[[300.0, 150.0]], 900.0)));
+        let wide = discs([640, 300], &[[150.0, 150.0], [490.0, 150.0]], 140.0);
+        assert!(!has_two_circles(&wide));
+    }
 }

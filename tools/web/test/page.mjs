@@ -34,6 +34,33 @@ async function clip(page) {
   }, `data:video/${kind};base64,${bytes.toString("base64")}`);
   console.log(`page: a clip of ${seen[0].toFixed(1)} s, ${bytes.length} bytes (.${kind})`);
   assert.ok(seen[0] > 3 && seen[0] < 12 && seen[1] > 100, `${seen}`);
+  return file;
+}
+
+/** A video gives frames, which are photographs like others; one that the browser cannot play is refused. */
+async function video(page, file) {
+  const broken = `${PLACE}/broken.mp4`;
+  fs.writeFileSync(broken, "no video");
+  await chooseFiles(page, [broken]);
+  await page.waitForSelector("#error:not([hidden])");
+  assert.match(await page.textContent("#error"), /broken\.mp4: this browser cannot play it/);
+  await page.click("#clear");
+  await chooseFiles(page, [file]);
+  await page.waitForFunction(() => photographs.length > 0);
+  const frames = await page.evaluate(() => Promise.all(photographs.map(async (photograph) => {
+    const picture = await createImageBitmap(photograph);
+    return { name: photograph.name, bytes: photograph.size, width: picture.width };
+  })));
+  assert.ok(frames.length >= 6 && frames.length <= 12, JSON.stringify(frames));
+  const width = await page.evaluate(() => viewer.canvas.width);
+  assert.ok(frames.every((frame) => frame.width === width && / \d+\.\d\d s\.jpg$/.test(frame.name)), JSON.stringify(frames));
+  // The clip goes there and back: frames of different times differ but for its ends.
+  assert.ok(new Set(frames.map((frame) => frame.bytes)).size > frames.length / 2, JSON.stringify(frames));
+  console.log(`page: ${frames.length} frames of the clip`);
+  await page.waitForSelector("#working:not([hidden])");
+  await page.click("#cancel");
+  await page.waitForFunction(() => document.getElementById("working").hidden);
+  assert.equal(await page.textContent("#error"), "Cancelled.");
 }
 
 /** A focal length reaches the library, which refuses one that no lens has. */
@@ -176,11 +203,12 @@ export async function testPage() {
     }
     if (way === "cpu") {
       await pageOfItsOwn(page);
-      await clip(page);
+      const recorded = await clip(page);
       await shares(page);
       await focalLength(page);
       await camera(page);
       await advice(page);
+      await video(page, recorded);
     }
     if (way === "webgl") {
       await page.screenshot({ path: `${PLACE}/page.png`, fullPage: true });

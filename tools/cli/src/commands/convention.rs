@@ -1,9 +1,10 @@
-//! Matrices of a pose file that contradict its photographs in the format's convention and fit them in another one.
+//! Cameras of a pose file that contradict its photographs: matrices that fit them in another convention than the format's,
+//! and other sources of cameras that fit them.
 
 use super::args::PoseConventionArg;
 use anyhow::Result;
 use clap::ValueEnum;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use subsplat::cameras::check::{CheckOptions, GrayImage, PairReport, Verdict, check_pair};
 use subsplat::files::photos::image::LoadOptions;
 use subsplat::files::poses::matrices::PoseConvention;
@@ -13,15 +14,16 @@ use subsplat::files::poses::scene::{Scene, load_scene_with};
 /// Half the resolution of `subsplat check`: turned axes miss the points by many pixels.
 const OPTIONS: CheckOptions = CheckOptions { longest_side: 480, features: 1200, seed: 1 };
 
-/// Returns the scene at `path` in the one convention in which its cameras fit the points that two photographs share, where the cameras of `scene`, in the format's convention, contradict them; else `scene`. A warning of the
-/// returned scene names both conventions.
+/// Returns the scene at `path` in the one convention, else from the first other source of cameras, that fits the points
+/// which two photographs share, where the cameras of `scene` contradict them; else `scene`. A warning of the returned
+/// scene says so. Conventions are tried where `may_turn`: the format has matrices.
 ///
 /// A pair at the beginning and one in the middle decide. Where the first one does not contradict, no other is looked at,
 /// so that an ordinary scene costs the check of two small pictures.
 ///
 /// # Errors
 /// The pose file cannot be read again.
-pub fn fitting(path: &Path, scene: Scene, options: &SceneOptions) -> Result<Scene> {
+pub fn fitting(path: &Path, scene: Scene, options: &SceneOptions, may_turn: bool) -> Result<Scene> {
     let count = scene.frames.len();
     // Neighbours in a video are too close together to contradict.
     let apart = (count / 5).clamp(1, 3);
@@ -36,6 +38,41 @@ pub fn fitting(path: &Path, scene: Scene, options: &SceneOptions) -> Result<Scen
         }
         pairs.push(pair);
     }
+    let contradicted = format!("{}: the photographs contradict its cameras", path.display());
+    if may_turn && let Some((mut other, name)) = turned(path, count, &pairs, options)? {
+        other.warnings.push(format!(
+            "{contradicted} in the convention of {} files, and fit them as {name}, so they are read as {name} \
+             (--pose-convention names another one)",
+            scene.source.name()
+        ));
+        return Ok(other);
+    }
+    for name in &scene.other_sources {
+        let options = SceneOptions { model: Some(name.into()), ..options.clone() };
+        // One that cannot be read is no better.
+        let Ok(mut other) = load_scene_with(path, &options) else { continue };
+        if pairs.iter().all(|pair| pair.fits(&other)) {
+            other.warnings.push(format!(
+                "{contradicted} in its file of {}, and fit those of {name}, which are read instead (--model names \
+                 another source)",
+                scene.source.name()
+            ));
+            return Ok(other);
+        }
+    }
+    Ok(scene)
+}
+
+/// The scene in the one convention that fits all `pairs`, and the convention's name.
+///
+/// # Errors
+/// The pose file cannot be read again.
+fn turned(
+    path: &Path,
+    count: usize,
+    pairs: &[Pair],
+    options: &SceneOptions,
+) -> Result<Option<(Scene, String)>> {
     let mut fitting = Vec::new();
     for convention in PoseConventionArg::value_variants() {
         let read = PoseConvention::from(*convention);
@@ -46,20 +83,12 @@ pub fn fitting(path: &Path, scene: Scene, options: &SceneOptions) -> Result<Scen
         }
     }
     let one = <[_; 1]>::try_from(fitting).ok();
-    let Some([(Some(name), mut other)]) = one else { return Ok(scene) };
-    other.warnings.push(format!(
-        "{}: the photographs contradict its cameras in the convention of {} files, and fit them as {name}, so they \
-         are read as {name} (--pose-convention names another one)",
-        path.display(),
-        scene.source.name(),
-        name = name.get_name(),
-    ));
-    Ok(other)
+    Ok(one.and_then(|[(name, other)]| Some((other, name?.get_name().to_owned()))))
 }
 
 /// Two photographs of a scene, grey.
 struct Pair {
-    frames: [usize; 2],
+    files: [PathBuf; 2],
     images: [GrayImage; 2],
 }
 
@@ -73,12 +102,15 @@ impl Pair {
         };
         let [i, j] = frames;
         let (a, b) = if i == j { (None, None) } else { rayon::join(|| grey(i), || grey(j)) };
-        Some(Self { frames, images: [a?, b?] })
+        let files = frames.map(|i| scene.frames[i].image.clone());
+        Some(Self { files, images: [a?, b?] })
     }
 
-    /// Check of the cameras of `scene`. `None` where a lens distortion cannot be removed.
+    /// Check of the cameras of `scene`. `None` where it lacks one of them, or a lens distortion cannot be removed.
     fn report(&self, scene: &Scene) -> Option<PairReport> {
-        let [a, b] = self.frames.map(|i| scene.frames[i].pinhole().ok());
+        let camera =
+            |file: &PathBuf| scene.frames.iter().find(|frame| frame.image == *file)?.pinhole().ok();
+        let [a, b] = self.files.each_ref().map(camera);
         let [image_a, image_b] = &self.images;
         Some(check_pair(image_a, &a?, image_b, &b?, &OPTIONS))
     }

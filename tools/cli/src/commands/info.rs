@@ -1,6 +1,7 @@
 //! `subsplat info`: describes a file or a scene.
 
 use super::args::InfoArgs;
+use super::render;
 use crate::report::{Answer, print_line};
 use anyhow::{Context, Result, bail};
 use serde_json::{Value, json};
@@ -18,6 +19,8 @@ pub fn info(args: &InfoArgs, answer: Answer) -> Result<()> {
     let metadata = std::fs::metadata(path).with_context(|| path.display().to_string())?;
     let report = if is_splat_file(path) {
         splats(path, answer)?
+    } else if render::is_scene(path) {
+        splats(&render::scene_file(path)?, answer)?
     } else if metadata.is_dir() {
         scene(path, answer)?
     } else {

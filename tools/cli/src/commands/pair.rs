@@ -84,8 +84,9 @@ pub fn load(
         one.display(),
         scene.source.name()
     );
-    if convention.is_none() && WITH_CONVENTION.contains(&scene.source) {
-        return fitting(one, scene, &options).map(Loaded::from);
+    let may_turn = convention.is_none() && WITH_CONVENTION.contains(&scene.source);
+    if may_turn || (convention.is_none() && !scene.other_sources.is_empty()) {
+        return fitting(one, scene, &options, may_turn).map(Loaded::from);
     }
     Ok(scene.into())
 }

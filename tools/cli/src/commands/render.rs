@@ -14,8 +14,9 @@ use std::path::{Path, PathBuf};
 use subsplat::files::photos::image::{probe, save_depth_png, save_png};
 use subsplat::files::photos::photograph::list_photographs;
 use subsplat::files::poses::cameras_json::is_cameras_json;
+use subsplat::files::poses::find::{folders, is_own_output};
 use subsplat::files::poses::reading::SceneOptions;
-use subsplat::files::poses::scene::{is_scene, load_cameras_with, load_scene_with};
+use subsplat::files::poses::scene::{self, load_cameras_with, load_scene_with};
 use subsplat::files::{is_splat_file, load_splat_file};
 use subsplat::scene::pictures::{Depth, Rgb};
 use subsplat::scene::render::{
@@ -116,7 +117,13 @@ pub fn load(file: &Path, strict: bool) -> Result<(Splats, Vec<String>)> {
     Ok((content.splats, content.comments))
 }
 
-/// Finds the scene file of `path`: the path itself, or the file in a folder that `run` wrote.
+/// Returns whether `path` is a scene file, or a folder that `run` or a training wrote.
+pub fn is_scene(path: &Path) -> bool {
+    is_splat_file(path) || is_own_output(path) || trained(path).is_some()
+}
+
+/// Finds the scene file of `path`: the path itself, or the file in a folder that `run`, or a training of 3D Gaussian
+/// Splatting, wrote.
 pub fn scene_file(path: &Path) -> Result<PathBuf> {
     if !path.is_dir() {
         ensure!(
@@ -133,11 +140,11 @@ pub fn scene_file(path: &Path) -> Result<PathBuf> {
     }
     let readable = SceneFormatArg::value_variants().iter().filter(|f| **f != SceneFormatArg::Html);
     let files = readable.map(|f| path.join(f.file_name()));
-    if let Some(file) = files.into_iter().find(|f| f.is_file()) {
+    if let Some(file) = files.into_iter().find(|f| f.is_file()).or_else(|| trained(path)) {
         return Ok(file);
     }
     let name = path.display();
-    let hint = if is_scene(path) || list_photographs(path).len() >= 2 {
+    let hint = if scene::is_scene(path) || list_photographs(path).len() >= 2 {
         format!("; it holds photographs: reconstruct them by `subsplat run {name}`")
     } else {
         String::new()
@@ -146,6 +153,27 @@ pub fn scene_file(path: &Path) -> Result<PathBuf> {
         "{name}: expected a scene file, or a folder with scene.ply as `subsplat run` writes it, \
          got a folder without one{hint}"
     )
+}
+
+/// Folder of the states of a training of 3D Gaussian Splatting, and the file of each.
+const TRAINED: [&str; 2] = ["point_cloud", "point_cloud.ply"];
+
+/// The last state of a training: `point_cloud/iteration_N/point_cloud.ply` with the largest N.
+fn trained(folder: &Path) -> Option<PathBuf> {
+    let [states, file] = TRAINED;
+    let steps = |state: &PathBuf| -> Option<u64> {
+        state.file_name()?.to_str()?.strip_prefix("iteration_")?.parse().ok()
+    };
+    let all = folders(folder.join(states)).into_iter().filter(|state| state.join(file).is_file());
+    let last = all.filter(|state| steps(state).is_some()).max_by_key(steps)?;
+    Some(last.join(file))
+}
+
+/// Folder in which cameras of the scene `file` lie: its own, or that of the training.
+fn folder_of(file: &Path) -> &Path {
+    let own = file.parent().unwrap_or(Path::new(""));
+    let states = own.parent().filter(|states| states.ends_with(TRAINED[0]));
+    states.and_then(Path::parent).unwrap_or(own)
 }
 
 /// Rejects cameras whose pictures exceed the memory, with the frame's name.
@@ -280,7 +308,7 @@ fn named_cameras(
     Ok(frames::file_stems(&names).into_iter().zip(cameras).collect())
 }
 
-/// Names and cameras of `given`, else of cameras.json beside the scene `file`, in the world of the splats
+/// Names and cameras of `given`, else of cameras.json beside the scene `file` or its training, in the world of the splats
 /// ([`read_cameras`]); `None` without either.
 pub fn cameras_beside(
     given: Option<&Path>,
@@ -288,7 +316,7 @@ pub fn cameras_beside(
     origin: DVec3,
     options: &SceneOptions,
 ) -> Result<Option<Vec<(String, Camera)>>> {
-    let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
+    let beside = folder_of(file).join("cameras.json");
     let source = match given {
         Some(path) => path,
         None if beside.is_file() => &beside,

@@ -219,6 +219,34 @@ fn export_merges_gaussians_to_half_and_a_quarter() {
     assert_eq!(called.json()["count"], all);
 }
 
+/// The folder of a training of 3D Gaussian Splatting: its last state, and its cameras.
+#[test]
+fn the_folder_of_a_training_is_a_scene() {
+    let place = tempfile::tempdir().unwrap();
+    let model = place.path().join("model");
+    for steps in ["7000", "30000"] {
+        let state = model.join(format!("point_cloud/iteration_{steps}"));
+        std::fs::create_dir_all(&state).unwrap();
+        save_one_splat(&state.join("point_cloud.ply"));
+    }
+    // A state that was stopped while it was written.
+    std::fs::create_dir_all(model.join("point_cloud/iteration_40000")).unwrap();
+    let cameras = r#"[{"id": 0, "img_name": "a", "width": 24, "height": 16, "position": [0, 0, 0],
+        "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 20, "fy": 20}]"#;
+    std::fs::write(model.join("cameras.json"), cameras).unwrap();
+    let info = call_in(place.path(), "--json info model").json();
+    let file = info["file"].as_str().unwrap();
+    assert!(info["kind"] == "splats" && file.contains("iteration_30000"), "{info}");
+    let drawn = call_in(place.path(), "--json render model -o drawn");
+    assert_eq!(drawn.code, 0, "{}", drawn.stderr);
+    let view = &drawn.json()["views"][0];
+    assert_eq!((&view["width"], &view["height"]), (&24.into(), &16.into()));
+    assert_eq!(call_in(place.path(), "export model -o a.spz").code, 0);
+    std::fs::remove_dir_all(model.join("point_cloud")).unwrap();
+    let error = call_in(place.path(), "render model -o drawn").error();
+    assert!(error.contains("a folder with scene.ply"), "{error}");
+}
+
 #[test]
 fn export_refuses_what_it_cannot_write() {
     let place = workplace();

@@ -87,6 +87,42 @@ fn the_convention_that_fits_the_photographs_is_found() {
     assert!(verdict == "bad" && line.is_none(), "{verdict} {line:?}");
 }
 
+/// Of two sources of cameras the one that fits the photographs is read, and a line says so.
+#[test]
+fn the_source_that_fits_the_photographs_is_found() {
+    let room = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/room");
+    let place = tempfile::tempdir().unwrap();
+    let text = std::fs::read_to_string(room.join("cameras.json")).unwrap();
+    let mut all: Value = serde_json::from_str(&text).unwrap();
+    let frames = all["frames"].as_array_mut().unwrap();
+    for frame in frames.iter_mut() {
+        frame["file"] = room.join(frame["file"].as_str().unwrap()).display().to_string().into();
+    }
+    let write = |name: &str, all: &Value| {
+        std::fs::write(place.path().join(name), all.to_string()).unwrap();
+    };
+    // A file of a name that is read after cameras.json, with the layout of that one.
+    write("transforms.json", &all);
+    let check = |arguments: &str| {
+        let called =
+            call_in(place.path(), &format!("--json check . --context 0,1 -o out {arguments}"));
+        let line = called.stderr.lines().find(|l| l.contains("read instead")).map(str::to_owned);
+        (called.json()["pairs"][0]["verdict"].clone(), line)
+    };
+    write("cameras.json", &all);
+    assert_eq!(check(""), ("ok".into(), None));
+    // The cameras of two photographs exchanged.
+    let frames = all["frames"].as_array_mut().unwrap();
+    let poses = [frames[0]["c2w"].clone(), frames[1]["c2w"].clone()];
+    (frames[0]["c2w"], frames[1]["c2w"]) = (poses[1].clone(), poses[0].clone());
+    write("cameras.json", &all);
+    let (verdict, line) = check("");
+    let line = line.unwrap();
+    assert!(verdict == "ok" && line.contains("those of transforms.json"), "{verdict} {line}");
+    // A flag is believed.
+    assert_eq!(check("--model cameras.json"), ("bad".into(), None));
+}
+
 /// Entries that are left out are listed at the end, and `render` refuses splats that are no numbers.
 #[test]
 fn what_is_left_out_is_listed() {

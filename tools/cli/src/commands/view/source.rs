@@ -12,7 +12,6 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
-use subsplat::files::is_splat_file;
 use subsplat::finish::PhaseRun;
 use subsplat::scene::navigation::{Start, up_of};
 use subsplat::scene::render::{camera_of_comments, origin_of_comments};
@@ -68,7 +67,7 @@ struct Unrefined {
 /// Loads or reconstructs the scene of the arguments.
 pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     match args.input.as_slice() {
-        [one] if is_splat_file(one) => finished(args, one, progress),
+        [one] if render::is_scene(one) => finished(args, &render::scene_file(one)?, progress),
         _ => photographs(args, progress),
     }
 }
@@ -76,7 +75,7 @@ pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
 /// Rejects flags for photographs where the scene is finished.
 pub fn check(args: &ViewArgs) -> Result<()> {
     if let ([one], Some(flag)) = (args.input.as_slice(), args.photograph_flag())
-        && is_splat_file(one)
+        && render::is_scene(one)
     {
         bail!("{flag}: only with photographs; {} is a finished scene", one.display());
     }
@@ -88,21 +87,18 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
         progress.stage("scene", |_| render::load(path, args.source.pair.read.strict))?;
     let options =
         render::options(&args.rendering(), args.source.near, SH_DEGREE, &splats, &comments)?;
-    let beside = path.parent().unwrap_or(Path::new("")).join("cameras.json");
     let origin = origin_of_comments(&comments);
     let read = args.source.pair.read.options(None);
-    let cameras = match &args.cameras {
-        Some(source) => render::read_cameras(source, origin, &read)?,
-        None if beside.is_file() => render::read_cameras(&beside, origin, &read)?,
+    let beside = render::cameras_beside(args.cameras.as_deref(), path, origin, &read)?;
+    let cameras = match beside {
+        Some(cameras) => cameras,
         None => {
             let own = camera_of_comments(&comments);
             vec![(String::new(), own.map_or_else(|| whole::camera(&splats, &comments), Ok)?)]
         }
     };
-    let Some((_, home)) = cameras.first() else {
-        let source = args.cameras.as_ref().unwrap_or(&beside);
-        bail!("{}: expected a camera, got none", source.display())
-    };
+    // `cameras_beside` refuses a file without any.
+    let (_, home) = cameras.first().context("no camera")?;
     let start = Start {
         home: *home,
         up: up_of(cameras.iter().map(|(_, c)| c)),

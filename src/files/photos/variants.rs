@@ -1,0 +1,309 @@
+//! Pictures of a folder that are no photographs of their own: the same one in another format, a copy, an edited
+//! version or another exposure of it, its mask, and maps of it such as depths.
+
+use super::exif::Shot;
+use super::photograph::PhotographHeader;
+use super::raw;
+use crate::files::lower_extension;
+use std::collections::{HashMap, HashSet};
+use std::path::{Path, PathBuf};
+
+/// Extensions of pictures that every program reads. Cameras and phones write another format beside one of them, and
+/// people convert to them: a file of the same name is the same photograph.
+const COMMON_EXTENSIONS: [&str; 7] = ["jpg", "jpeg", "jpe", "jfif", "png", "tif", "tiff"];
+/// Characters between the words of a name.
+const SEPARATORS: [char; 4] = ['_', '-', '.', ' '];
+/// The word of a mask's name.
+const MASK: &str = "mask";
+/// Extensions of masks.
+const MASK_EXTENSIONS: [&str; 5] = ["png", "PNG", "jpg", "JPG", "jpeg"];
+/// Words of the names of maps, which renderers, depth cameras and networks write beside a picture.
+const MAPS: [&str; 15] = [
+    MASK,
+    "masks",
+    "matte",
+    "depth",
+    "disparity",
+    "disp",
+    "normal",
+    "normals",
+    "confidence",
+    "conf",
+    "seg",
+    "segmentation",
+    "semantic",
+    "labels",
+    "albedo",
+];
+/// Words of the names of pictures that have maps beside them.
+const COLOURS: [&str; 6] = ["rgb", "color", "colour", "image", "img", "frame"];
+/// Ends of the names of edited versions: Google, Lightroom, Samsung.
+const EDITED: [&str; 7] =
+    ["-edited", "_edited", " (edited)", "-edit", "_edit", "-bearbeitet", "~2"];
+/// Longest time between two exposures of one view, seconds: the tag has whole seconds.
+const SERIES_SECONDS: f64 = 2.0;
+/// Fewest exposures of one view.
+const SERIES_LEAST: usize = 3;
+
+/// Reasons, the same for all files of a kind: one line names them.
+const IS_MASK: &str = "the mask of a photograph beside it";
+const IS_MAP: &str = "a map of a photograph beside it, such as depths or normals";
+const IS_EDITED: &str = "an edited version of a photograph beside it";
+const IS_EXPOSURE: &str = "another exposure of a photograph beside it, by EXIF";
+
+/// A picture that can be read.
+pub(super) struct Found {
+    pub path: PathBuf,
+    pub header: PhotographHeader,
+}
+
+/// Pictures to leave out: indices with reasons.
+type LeftOut = Vec<(usize, String)>;
+
+/// Divides the pictures of a folder into photographs and those that are left out, each with the reason.
+pub(super) fn sorted_out(mut all: Vec<Found>) -> (Vec<PathBuf>, Vec<[String; 2]>) {
+    let mut left_out = Vec::new();
+    for rule in [twins, maps, copies, edited, exposures] {
+        let mut out = rule(&all);
+        out.sort();
+        left_out.extend(out.iter().map(|(i, why)| [name_of(&all[*i].path), why.clone()]));
+        out.iter().rev().for_each(|(i, _)| drop(all.remove(*i)));
+    }
+    (all.into_iter().map(|found| found.path).collect(), left_out)
+}
+
+/// Name of a file without its folders.
+pub(super) fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+fn stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase()
+}
+
+/// Raw, HEIC, AVIF and JPEG XL files beside a JPEG, PNG or TIFF of the same name: two photographs from one place.
+fn twins(all: &[Found]) -> LeftOut {
+    let is_common = |path: &Path| COMMON_EXTENSIONS.contains(&lower_extension(path).as_str());
+    let paths = || all.iter().map(|found| found.path.as_path());
+    let common: HashSet<String> = paths().filter(|path| is_common(path)).map(stem).collect();
+    // Only formats of cameras and phones, not every other extension.
+    let is_twin = |path: &Path| {
+        !is_common(path) && has_format_of_its_own(path) && common.contains(&stem(path))
+    };
+    let reason = || "a JPEG, PNG or TIFF of the same name is read".to_owned();
+    paths().enumerate().filter(|(_, path)| is_twin(path)).map(|(i, _)| (i, reason())).collect()
+}
+
+/// Returns whether an extension is one of HEIC, AVIF, JPEG XL or a raw format.
+fn has_format_of_its_own(path: &Path) -> bool {
+    let extension = lower_extension(path);
+    ["heic", "heif", "hif", "avif", "jxl", "cr3", "raf"].contains(&extension.as_str())
+        || raw::EXTENSIONS.contains(&extension.as_str())
+}
+
+/// Files that equal another one byte for byte, such as `a (1).jpg` beside `a.jpg`: they show one place. The one with the
+/// shortest name stays.
+fn copies(all: &[Found]) -> LeftOut {
+    let mut of_size: HashMap<u64, Vec<usize>> = HashMap::new();
+    for (i, found) in all.iter().enumerate() {
+        // A file without a size is an error of its reader.
+        if let Ok(metadata) = found.path.metadata() {
+            of_size.entry(metadata.len()).or_default().push(i);
+        }
+    }
+    let name = |i: usize| name_of(&all[i].path);
+    let mut copies = LeftOut::new();
+    for mut same in of_size.into_values().filter(|same| same.len() > 1) {
+        same.sort_by_key(|&i| (name(i).len(), i));
+        let mut kept: Vec<(usize, Vec<u8>)> = Vec::new();
+        for i in same {
+            let Ok(bytes) = std::fs::read(&all[i].path) else { continue };
+            match kept.iter().find(|(_, other)| *other == bytes) {
+                Some((first, _)) => copies.push((i, format!("a copy of {}", name(*first)))),
+                None => kept.push((i, bytes)),
+            }
+        }
+    }
+    copies
+}
+
+/// Words of a name in lower case, without those of colours; and whether one is that of a map, which is left out too.
+fn words(path: &Path) -> (Vec<String>, bool) {
+    let stem = stem(path);
+    let all = stem.split(SEPARATORS).filter(|word| !word.is_empty() && !COLOURS.contains(word));
+    let (maps, others): (Vec<&str>, Vec<&str>) = all.partition(|word| MAPS.contains(word));
+    (others.into_iter().map(str::to_owned).collect(), !maps.is_empty())
+}
+
+/// Masks and maps: names that become another picture's without one word.
+fn maps(all: &[Found]) -> LeftOut {
+    let named: Vec<(Vec<String>, bool)> = all.iter().map(|found| words(&found.path)).collect();
+    let plain: HashMap<&[String], &Path> = named
+        .iter()
+        .zip(all)
+        .filter(|((words, is_map), _)| !is_map && !words.is_empty())
+        .map(|((words, _), found)| (words.as_slice(), found.path.as_path()))
+        .collect();
+    let of_map = |(i, (words, is_map)): (usize, &(Vec<String>, bool))| {
+        let of = plain.get(words.as_slice()).filter(|_| *is_map)?;
+        let is_mask = mask_beside(of).is_some_and(|mask| mask == all[i].path);
+        Some((i, if is_mask { IS_MASK } else { IS_MAP }.to_owned()))
+    };
+    named.iter().enumerate().filter_map(of_map).collect()
+}
+
+/// The mask of a photograph in its own folder: `a_mask.png` or `mask_a.png` of `a.jpg`, `a_mask.png` of `a_rgb.png`.
+pub(super) fn mask_beside(image: &Path) -> Option<PathBuf> {
+    let stem = image.file_stem()?.to_string_lossy();
+    let mut stems = Vec::new();
+    for word in [MASK, "Mask", "MASK"] {
+        for separator in SEPARATORS {
+            stems.push(format!("{stem}{separator}{word}"));
+            stems.push(format!("{word}{separator}{stem}"));
+        }
+        let parts: Vec<&str> = stem.split(SEPARATORS).collect();
+        let colour = |part: &&str| COLOURS.contains(&part.to_lowercase().as_str());
+        stems.extend(parts.iter().filter(|part| colour(part)).map(|part| {
+            let at = part.as_ptr() as usize - stem.as_ptr() as usize;
+            format!("{}{word}{}", &stem[..at], &stem[at + part.len()..])
+        }));
+    }
+    let names = stems
+        .iter()
+        .flat_map(|stem| MASK_EXTENSIONS.map(|extension| format!("{stem}.{extension}")));
+    names.map(|name| image.with_file_name(name)).find(|path| path != image && path.is_file())
+}
+
+/// Edited versions beside the photograph itself. They may be cropped, and have other colours.
+fn edited(all: &[Found]) -> LeftOut {
+    let stems: HashSet<String> = all.iter().map(|found| stem(&found.path)).collect();
+    let of_version = |(i, found): (usize, &Found)| {
+        stems.contains(&original(&stem(&found.path))?).then(|| (i, IS_EDITED.to_owned()))
+    };
+    all.iter().enumerate().filter_map(of_version).collect()
+}
+
+/// Stem of the photograph of which an edited version has this stem, in lower case.
+fn original(stem: &str) -> Option<String> {
+    // Phones of Apple: IMG_E1234 beside IMG_1234.
+    let number = stem.strip_prefix("img_e").filter(|rest| rest.bytes().all(|b| b.is_ascii_digit()));
+    let of_apple = number.filter(|number| !number.is_empty()).map(|n| format!("img_{n}"));
+    of_apple.or_else(|| EDITED.iter().find_map(|end| Some(stem.strip_suffix(end)?.to_owned())))
+}
+
+/// Series of exposures from one place, by EXIF: the one nearest to the measured exposure stays.
+fn exposures(all: &[Found]) -> LeftOut {
+    let shot = |i: usize| all[i].header.shot;
+    let timed = all.iter().enumerate().filter_map(|(i, found)| Some((i, found.header.shot?)));
+    let mut timed: Vec<(usize, Shot)> = timed.collect();
+    timed.sort_by(|(i, a), (j, b)| a.seconds.total_cmp(&b.seconds).then(i.cmp(j)));
+    let like = |i: usize, j: usize| {
+        let of = |i: usize| {
+            let header = &all[i].header;
+            let camera = &header.camera;
+            (header.width, header.height, camera.make.as_deref(), camera.model.as_deref())
+        };
+        of(i) == of(j)
+    };
+    let mut series: Vec<Vec<usize>> = Vec::new();
+    for (i, own) in timed {
+        let goes_on = series.last().is_some_and(|series: &Vec<usize>| {
+            let last = series.last().and_then(|&last| Some((last, shot(last)?)));
+            let soon = |(last, shot): (usize, Shot)| {
+                own.seconds - shot.seconds <= SERIES_SECONDS && like(last, i)
+            };
+            last.is_some_and(soon)
+                && series.iter().all(|&j| shot(j).is_some_and(|other| other.bias != own.bias))
+        });
+        match series.last_mut().filter(|_| goes_on) {
+            Some(series) => series.push(i),
+            None => series.push(vec![i]),
+        }
+    }
+    let bias = |i: usize| shot(i).map_or(0.0, |shot| shot.bias);
+    let mut out = LeftOut::new();
+    for series in series.iter().filter(|series| series.len() >= SERIES_LEAST) {
+        let middle = series.iter().min_by(|&&i, &&j| bias(i).abs().total_cmp(&bias(j).abs()));
+        let others = series.iter().filter(|i| Some(*i) != middle);
+        out.extend(others.map(|&i| (i, IS_EXPOSURE.to_owned())));
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::files::photos::exif::ExifCamera;
+
+    fn found(path: &Path, shot: Option<Shot>) -> Found {
+        let header = PhotographHeader {
+            width: 6,
+            height: 4,
+            orientation: None,
+            camera: ExifCamera::default(),
+            shot,
+            panorama: false,
+            warnings: Vec::new(),
+        };
+        Found { path: path.to_owned(), header }
+    }
+
+    /// What is left out of files of these names with different bytes.
+    fn left_out(names: &[&str]) -> Vec<[String; 2]> {
+        let folder = tempfile::tempdir().unwrap();
+        let files = names.iter().map(|name| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, name).unwrap();
+            found(&path, None)
+        });
+        sorted_out(files.collect()).1
+    }
+
+    #[test]
+    fn masks_maps_and_edited_versions_are_told_by_their_names() {
+        let cases: &[(&[&str], &[(&str, &str)])] = &[
+            (
+                &["a.jpg", "a_mask.png", "A-Depth.png", "b.jpg", "b.normals.jpg"],
+                &[("a_mask.png", IS_MASK), ("A-Depth.png", IS_MAP), ("b.normals.jpg", IS_MAP)],
+            ),
+            (
+                &["0001_rgb.png", "0001_depth.png", "0001_Mask.png", "rgb_2.png", "depth_2.png"],
+                &[("0001_depth.png", IS_MAP), ("0001_Mask.png", IS_MASK), ("depth_2.png", IS_MAP)],
+            ),
+            // Masks that have words of their own: not the one that is read.
+            (&["a.jpg", "a_dog_mask.png", "b_mask.tif", "b.jpg"], &[("b_mask.tif", IS_MAP)]),
+            // Photographs of masks, and a map alone.
+            (&["mask.jpg", "mask 2.jpg", "a_depth.png", "IMG_1.jpg", "img.jpg"], &[]),
+            (
+                &["IMG_1234.HEIC", "IMG_E1234.JPG", "IMG_E77.JPG", "c-edited.jpg", "c.jpg"],
+                &[("IMG_E1234.JPG", IS_EDITED), ("c-edited.jpg", IS_EDITED)],
+            ),
+        ];
+        for (names, expected) in cases {
+            let expected: Vec<[String; 2]> =
+                expected.iter().map(|(name, why)| [*name, *why].map(str::to_owned)).collect();
+            assert_eq!(left_out(names), expected, "{names:?}");
+        }
+    }
+
+    #[test]
+    fn of_a_series_of_exposures_one_stays() {
+        let series = |shots: &[(f64, f64)]| {
+            let shot = |(i, (seconds, bias)): (usize, &(f64, f64))| {
+                let name = format!("{i}.jpg");
+                found(Path::new(&name), Some(Shot { seconds: *seconds, bias: *bias }))
+            };
+            let all: Vec<Found> = shots.iter().enumerate().map(shot).collect();
+            exposures(&all).into_iter().map(|(i, _)| i).collect::<Vec<_>>()
+        };
+        // Two series, the second one right behind the first one.
+        let two = [(0.0, 0.0), (0.0, -2.0), (1.0, 2.0), (2.0, 0.0), (3.0, -2.0), (3.0, 2.0)];
+        assert_eq!(series(&two), [1, 2, 4, 5]);
+        // A pair, other times, and one exposure for all.
+        assert!(series(&[(0.0, 0.0), (1.0, 1.0)]).is_empty());
+        assert!(series(&[(0.0, 0.0), (5.0, 1.0), (10.0, 2.0)]).is_empty());
+        assert!(series(&[(0.0, 0.7), (1.0, 0.7), (2.0, 0.7), (3.0, 0.7)]).is_empty());
+        // The one nearest to the measured exposure.
+        assert_eq!(series(&[(0.0, -3.0), (0.0, -1.0), (0.0, 2.0)]), [0, 2]);
+    }
+}
