@@ -48,12 +48,14 @@ pub(super) fn pages(bytes: &[u8]) -> usize {
     {
         seen.push(directory);
         let Some(entries) = file.number(directory, 2).map(|count| count as usize) else { break };
+        // A directory that is cut is no page.
+        let Some(link) = file.number(directory + 2 + 12 * entries, 4) else { break };
         let tag = |at: &usize| file.number(*at, 2) == Some(u32::from(NEW_SUBFILE_TYPE));
         let kind = (0..entries).map(|i| directory + 2 + 12 * i).find(tag);
         // A page of several has the bit 2, which leaves the others.
         let kind = kind.and_then(|at| file.number(at + 8, 4)).unwrap_or(0);
         pages += usize::from(kind & !2 == 0);
-        next = file.number(directory + 2 + 12 * entries, 4);
+        next = Some(link);
     }
     pages
 }

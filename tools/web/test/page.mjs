@@ -53,7 +53,7 @@ async function video(page, file) {
   })));
   assert.ok(frames.length >= 6 && frames.length <= 12, JSON.stringify(frames));
   const width = await page.evaluate(() => viewer.canvas.width);
-  assert.ok(frames.every((frame) => frame.width === width && / \d+\.\d\d s\.jpg$/.test(frame.name)), JSON.stringify(frames));
+  assert.ok(frames.every((frame) => Math.abs(frame.width - width) <= 2 && / \d+\.\d\d s\.jpg$/.test(frame.name)), JSON.stringify(frames));
   // The clip goes there and back: frames of different times differ but for its ends.
   assert.ok(new Set(frames.map((frame) => frame.bytes)).size > frames.length / 2, JSON.stringify(frames));
   console.log(`page: ${frames.length} frames of the clip`);

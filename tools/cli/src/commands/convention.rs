@@ -38,12 +38,11 @@ pub fn fitting(path: &Path, scene: Scene, options: &SceneOptions, may_turn: bool
         }
         pairs.push(pair);
     }
-    let contradicted = format!("{}: the photographs contradict its cameras", path.display());
+    let (at, format) = (path.display(), scene.source.name());
     if may_turn && let Some((mut other, name)) = turned(path, count, &pairs, options)? {
         other.warnings.push(format!(
-            "{contradicted} in the convention of {} files, and fit them as {name}, so they are read as {name} \
-             (--pose-convention names another one)",
-            scene.source.name()
+            "{at}: the photographs contradict its cameras in the convention of {format} files, and fit them as {name}, \
+             so they are read as {name} (--pose-convention names another one)"
         ));
         return Ok(other);
     }
@@ -53,9 +52,8 @@ pub fn fitting(path: &Path, scene: Scene, options: &SceneOptions, may_turn: bool
         let Ok(mut other) = load_scene_with(path, &options) else { continue };
         if pairs.iter().all(|pair| pair.fits(&other)) {
             other.warnings.push(format!(
-                "{contradicted} in its file of {}, and fit those of {name}, which are read instead (--model names \
-                 another source)",
-                scene.source.name()
+                "{at}: the photographs contradict the cameras of {format}, and fit those of {name}, which are read \
+                 instead (--model names another source)"
             ));
             return Ok(other);
         }

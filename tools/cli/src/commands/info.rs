@@ -19,7 +19,7 @@ pub fn info(args: &InfoArgs, answer: Answer) -> Result<()> {
     let metadata = std::fs::metadata(path).with_context(|| path.display().to_string())?;
     let report = if is_splat_file(path) {
         splats(path, answer)?
-    } else if render::is_scene(path) {
+    } else if render::is_training(path) {
         splats(&render::scene_file(path)?, answer)?
     } else if metadata.is_dir() {
         scene(path, answer)?

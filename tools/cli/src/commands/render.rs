@@ -119,7 +119,12 @@ pub fn load(file: &Path, strict: bool) -> Result<(Splats, Vec<String>)> {
 
 /// Returns whether `path` is a scene file, or a folder that `run` or a training wrote.
 pub fn is_scene(path: &Path) -> bool {
-    is_splat_file(path) || is_own_output(path) || trained(path).is_some()
+    is_splat_file(path) || is_own_output(path) || is_training(path)
+}
+
+/// Returns whether a training of 3D Gaussian Splatting wrote the folder `path`.
+pub fn is_training(path: &Path) -> bool {
+    trained(path).is_some()
 }
 
 /// Finds the scene file of `path`: the path itself, or the file in a folder that `run`, or a training of 3D Gaussian

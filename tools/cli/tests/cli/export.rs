@@ -243,8 +243,8 @@ fn the_folder_of_a_training_is_a_scene() {
     assert_eq!((&view["width"], &view["height"]), (&24.into(), &16.into()));
     assert_eq!(call_in(place.path(), "export model -o a.spz").code, 0);
     std::fs::remove_dir_all(model.join("point_cloud")).unwrap();
-    let error = call_in(place.path(), "render model -o drawn").error();
-    assert!(error.contains("a folder with scene.ply"), "{error}");
+    let called = call_in(place.path(), "render model -o drawn");
+    assert!(called.error().contains("a folder with scene.ply"), "{}", called.stderr);
 }
 
 #[test]

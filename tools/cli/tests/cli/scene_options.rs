@@ -48,6 +48,24 @@ fn models_pictures_and_axes_are_chosen() {
     assert_ne!(wrong["overlap"], right["overlap"], "{wrong} {right}");
 }
 
+/// A transforms.json of the frames of a cameras.json in the folder `room`, with `matrix` of each pose.
+fn transforms(all: &Value, room: &Path, matrix: &dyn Fn(Mat4) -> Mat4) -> Value {
+    let frame = |f: &Value| {
+        let rows: Vec<Vec<f32>> = serde_json::from_value(f["c2w"].clone()).unwrap();
+        let c2w = [&rows[..3].concat()[..], &[0.0, 0.0, 0.0, 1.0]].concat();
+        let c2w = Mat4::from_cols_slice(&c2w).transpose();
+        let rows = matrix(c2w).transpose().to_cols_array_2d();
+        serde_json::json!({ "file_path": room.join(f["file"].as_str().unwrap()), "fl_x": f["fx"],
+            "fl_y": f["fy"], "cx": f["cx"], "cy": f["cy"], "w": f["width"], "h": f["height"],
+            "transform_matrix": rows })
+    };
+    let frames: Vec<Value> = all["frames"].as_array().unwrap().iter().map(frame).collect();
+    serde_json::json!({ "frames": frames })
+}
+
+/// Axes of OpenGL in those of OpenCV.
+const OPENGL: Vec3 = Vec3::new(1.0, -1.0, -1.0);
+
 /// Matrices in another convention than their format's are read in the one that fits the photographs, and a line says so.
 #[test]
 fn the_convention_that_fits_the_photographs_is_found() {
@@ -56,26 +74,15 @@ fn the_convention_that_fits_the_photographs_is_found() {
     let text = std::fs::read_to_string(room.join("cameras.json")).unwrap();
     let all: Value = serde_json::from_str(&text).unwrap();
     let report = |scene: &str, matrix: &dyn Fn(Mat4) -> Mat4, arguments: &str| {
-        let frame = |f: &Value| {
-            let rows: Vec<Vec<f32>> = serde_json::from_value(f["c2w"].clone()).unwrap();
-            let c2w = [&rows[..3].concat()[..], &[0.0, 0.0, 0.0, 1.0]].concat();
-            let c2w = Mat4::from_cols_slice(&c2w).transpose();
-            let rows = matrix(c2w).transpose().to_cols_array_2d();
-            serde_json::json!({ "file_path": room.join(f["file"].as_str().unwrap()), "fl_x": f["fx"],
-                "fl_y": f["fy"], "cx": f["cx"], "cy": f["cy"], "w": f["width"], "h": f["height"],
-                "transform_matrix": rows })
-        };
-        let frames: Vec<Value> = all["frames"].as_array().unwrap().iter().map(frame).collect();
         std::fs::create_dir_all(place.path().join(scene)).unwrap();
-        let text = serde_json::json!({ "frames": frames }).to_string();
+        let text = transforms(&all, &room, matrix).to_string();
         std::fs::write(place.path().join(scene).join("transforms.json"), text).unwrap();
         let call = format!("--json check {scene} --context 0,1 -o out {arguments}");
         let called = call_in(place.path(), &call);
         let line = called.stderr.lines().find(|l| l.contains("are read as")).map(str::to_owned);
         (called.json()["pairs"][0]["verdict"].clone(), line)
     };
-    let opengl = Mat4::from_scale(Vec3::new(1.0, -1.0, -1.0));
-    assert_eq!(report("opengl", &|m| m * opengl, "").1, None);
+    assert_eq!(report("opengl", &|m| m * Mat4::from_scale(OPENGL), "").1, None);
     let (verdict, line) = report("opencv", &|m| m, "");
     assert_eq!(verdict, "ok");
     let line = line.unwrap();
@@ -101,8 +108,7 @@ fn the_source_that_fits_the_photographs_is_found() {
     let write = |name: &str, all: &Value| {
         std::fs::write(place.path().join(name), all.to_string()).unwrap();
     };
-    // A file of a name that is read after cameras.json, with the layout of that one.
-    write("transforms.json", &all);
+    write("transforms.json", &transforms(&all, &room, &|m| m * Mat4::from_scale(OPENGL)));
     let check = |arguments: &str| {
         let called =
             call_in(place.path(), &format!("--json check . --context 0,1 -o out {arguments}"));
@@ -111,10 +117,11 @@ fn the_source_that_fits_the_photographs_is_found() {
     };
     write("cameras.json", &all);
     assert_eq!(check(""), ("ok".into(), None));
-    // The cameras of two photographs exchanged.
+    // Each photograph with the camera of the next one.
     let frames = all["frames"].as_array_mut().unwrap();
-    let poses = [frames[0]["c2w"].clone(), frames[1]["c2w"].clone()];
-    (frames[0]["c2w"], frames[1]["c2w"]) = (poses[1].clone(), poses[0].clone());
+    let mut poses: Vec<Value> = frames.iter().map(|frame| frame["c2w"].clone()).collect();
+    poses.rotate_left(1);
+    frames.iter_mut().zip(poses).for_each(|(frame, pose)| frame["c2w"] = pose);
     write("cameras.json", &all);
     let (verdict, line) = check("");
     let line = line.unwrap();
