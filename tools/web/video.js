@@ -9,22 +9,32 @@ const GREY_SIDE = 320;
 const LOOKS = 4;
 /** Mean difference of two small pictures, of 255, below which they show one view. */
 const SAME_VIEW = 2;
-/** Most time to wait for a frame, milliseconds. */
-const PATIENCE = 15000;
+/** Time in which the browser should begin to play or go on, and between two looks where it does not tell its pictures,
+ * milliseconds. */
+const PATIENCE = 15000, WAIT = 100;
+/** Time that playing the whole video should take, seconds, and how many times faster than normal browsers play. */
+const PLAYED_IN = 15, FASTEST = 16;
 
 const isVideo = (file) => file.type.startsWith("video/") || /\.(mp4|m4v|mov|webm|mkv)$/i.test(file.name);
+
+const cannotPlay = (name) => new Error(
+  `${name}: this browser cannot play it; choose photographs, or a video as .mp4 (H.264) or .webm`);
 
 /** Resolves at the next `event` of `video`; an error of it rejects. */
 function next(video, event, name) {
   return new Promise((done, fail) => {
-    const cannot = () => fail(new Error(
-      `${name}: this browser cannot play it; choose photographs, or a video as .mp4 (H.264) or .webm`));
+    const cannot = () => fail(cannotPlay(name));
     const timer = setTimeout(cannot, PATIENCE);
     const end = (what) => () => { clearTimeout(timer); what(); };
     video.addEventListener(event, end(done), { once: true });
     video.addEventListener("error", end(cannot), { once: true });
   });
 }
+
+/** Resolves when a video that plays has another picture, or after a while. */
+const picture = (video) => Promise.race([
+  new Promise((done) => video.requestVideoFrameCallback?.(done)), new Promise((done) => setTimeout(done, WAIT)),
+]);
 
 /** A picture of `video` whose longer side is at most `side`. */
 function drawn(video, side) {
@@ -55,49 +65,68 @@ function look(video) {
 const difference = (a, b) => a.reduce((sum, v, i) => sum + Math.abs(v - b[i]), 0) / a.length;
 
 /** At most `most` frames of the video `file` as JPEG files. Views that repeat the one before are left out. `report`
- * receives the part that is done; `signal` ends the work.
+ * receives the part that is done; `signal` ends the work. The video is played: browsers draw black or the frame before
+ * after a seek in some files.
  *
  * Throws where the browser cannot play the video, or where it shows one view alone. */
 async function videoFrames(file, most, report, signal) {
   const video = document.createElement("video");
-  video.muted = true;
+  video.muted = video.playsInline = true;
   video.preload = "auto";
   video.src = URL.createObjectURL(file);
   try {
     await next(video, "loadeddata", file.name);
-    // A recording of a browser states no length before its end is sought.
-    if (!Number.isFinite(video.duration)) {
-      const known = next(video, "durationchange", file.name);
-      video.currentTime = 1e9;
-      await known;
-    }
-    const at = async (time) => {
-      signal.throwIfAborted();
-      const sought = next(video, "seeked", file.name);
-      video.currentTime = time;
-      await sought;
-    };
+    if (!Number.isFinite(video.duration)) await soughtEnd(video, file.name);
+    const length = video.duration, title = file.name.replace(/\.[^.]*$/, "");
     const frames = [];
-    let before = null;
-    for (let part = 0; part < most; part++) {
-      let best = null;
-      for (let i = 0; i < LOOKS; i++) {
-        const time = video.duration * (part + (i + 0.5) / LOOKS) / most;
-        await at(time);
-        const seen = look(video);
-        if (!best || seen.sharpness > best.sharpness) best = { ...seen, time };
-        report((part + (i + 1) / LOOKS) / most);
+    let best = null, looked = -Infinity, before = null;
+    const take = () => {
+      if (best && !(before && difference(best.grey, before) < SAME_VIEW)) {
+        const { time, canvas } = best;
+        const blob = new Promise((done) => canvas.toBlob(done, "image/jpeg", 0.95));
+        frames.push({ blob, name: `${title} ${time.toFixed(2)} s.jpg` });
+        before = best.grey;
       }
-      if (before && difference(best.grey, before) < SAME_VIEW) continue;
-      before = best.grey;
-      await at(best.time);
-      const blob = await new Promise((done) => drawn(video, FRAME_SIDE).toBlob(done, "image/jpeg", 0.95));
-      const name = `${file.name.replace(/\.[^.]*$/, "")} ${best.time.toFixed(2)} s.jpg`;
-      frames.push(new File([blob], name, { type: "image/jpeg" }));
+      best = null;
+    };
+    const played = next(video, "playing", file.name);
+    video.playbackRate = Math.min(Math.max(length / PLAYED_IN, 1), FASTEST);
+    video.play().catch(() => {});
+    await played;
+    let part = 0, moved = performance.now();
+    while (!video.ended) {
+      signal.throwIfAborted();
+      const time = video.currentTime;
+      if (time >= looked + length / (most * LOOKS)) {
+        [looked, moved] = [time, performance.now()];
+        if (Math.floor(time / length * most) > part) {
+          take();
+          part = Math.floor(time / length * most);
+        }
+        const seen = look(video);
+        if (!best || seen.sharpness > best.sharpness) best = { ...seen, time, canvas: drawn(video, FRAME_SIDE) };
+        report(time / length);
+      }
+      // A tab that is not seen may wait.
+      if (document.hidden) moved = performance.now();
+      if (performance.now() > moved + PATIENCE) throw cannotPlay(file.name);
+      await picture(video);
     }
+    take();
     if (frames.length < 2) throw new Error(`${file.name}: expected a video in which the camera moves, got one view`);
-    return frames;
+    return await Promise.all(
+      frames.map(async ({ blob, name }) => new File([await blob], name, { type: "image/jpeg" })));
   } finally {
+    video.pause();
     URL.revokeObjectURL(video.src);
+  }
+}
+
+/** Seeks the end of a recording that does not state its length, and returns to its begin. */
+async function soughtEnd(video, name) {
+  for (const time of [1e9, 0]) {
+    const sought = next(video, "seeked", name);
+    video.currentTime = time;
+    await sought;
   }
 }
