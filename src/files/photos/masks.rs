@@ -272,6 +272,11 @@ mod tests {
             jpeg.save(at(file)).unwrap();
         }
         assert_eq!(photograph(&at("images/a.jpg")).mask, None);
+        // One beside the photograph, without a folder of masks.
+        let beside = at("images/a-Mask.png");
+        save_mask(&beside, [8, 6], grey);
+        assert_eq!(photograph(&at("images/a.jpg")).mask, Some(expected()));
+        fs::remove_file(beside).unwrap();
         // COLMAP, the stem alone, a JPEG among the photographs, and another size.
         save_mask(&at("masks/a.jpg.png"), [8, 6], |x, y| grey(x, y).min(1));
         save_mask(&at("masks/day 1/b.png"), [16, 12], |x, y| grey(x / 2, y / 2));
@@ -284,14 +289,11 @@ mod tests {
         let found = photograph(&at("images/c.jpg"));
         assert_eq!((found.mask, found.warnings.len()), (None, 1));
         assert!(found.warnings[0].contains("c.jpg.png"), "{:?}", found.warnings);
-        // One beside the photograph.
+        // One beside the photograph, which the folder lacks.
         let beside = at("images/c_mask.png");
         save_mask(&beside, [8, 6], grey);
         assert_eq!(photograph(&at("images/c.jpg")).mask, Some(expected()));
         fs::remove_file(beside).unwrap();
-        jpeg.save(at("images 2.jpg")).unwrap();
-        save_mask(&at("images 2-Mask.png"), [8, 6], grey);
-        assert_eq!(photograph(&at("images 2.jpg")).mask, Some(expected()));
         // So does another shape.
         save_mask(&at("masks/c.jpg.png"), [6, 8], |_, _| 0);
         let found = photograph(&at("images/c.jpg"));
