@@ -5,7 +5,7 @@ use subsplat::cameras::estimation::Confidence;
 use subsplat::kernels::camera::Camera;
 use subsplat::reconstruct::{EstimatedPhotos, Projection};
 use subsplat::{
-    EstimateOptions, EstimatedScene, LoadOptions, Photograph, Rgb, estimate_cameras,
+    EstimateOptions, EstimatedScene, KnownLens, LoadOptions, Photograph, Rgb, estimate_cameras,
     estimate_cameras_of_files, load_photograph,
 };
 use subsplat_test_support::box_room::{
@@ -55,11 +55,17 @@ fn photographs(ray: Ray) -> Vec<Rgb> {
 
 /// The estimate, and pictures and cameras of its frames.
 fn estimated(pictures: &[Rgb], projection: Projection) -> (EstimatedScene, Vec<(Rgb, Camera)>) {
+    estimated_with(pictures, &EstimateOptions { projection, ..EstimateOptions::default() })
+}
+
+/// [`estimated`] with all options.
+fn estimated_with(
+    pictures: &[Rgb],
+    options: &EstimateOptions,
+) -> (EstimatedScene, Vec<(Rgb, Camera)>) {
     let folder = tempfile::tempdir().unwrap();
     let files = save_pictures(folder.path(), pictures);
-    let options = EstimateOptions { projection, ..EstimateOptions::default() };
-    let found =
-        estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
+    let found = estimate_cameras_of_files(folder.path(), &files, options, &mut |_| Ok(())).unwrap();
     let loaded = found.scene.frames.iter().map(|frame| frame.load().unwrap()).collect();
     (found, loaded)
 }
@@ -134,4 +140,18 @@ fn photographs_of_a_pinhole_stay_as_they_are() {
     assert!(found.scene.frames.iter().all(|frame| frame.cut.is_none()));
     let errors = errors(&found.estimate.cameras);
     assert!(errors[0] < 0.3 && errors[1] < 1.5, "{errors:?}");
+}
+
+/// A focal length that a person gives is that of the middle of the picture.
+#[test]
+fn a_given_focal_length_leaves_the_bend_to_be_found() {
+    let fov = 2.0 * (0.5 * SIZE[0] as f64 / FOCAL).atan();
+    let lens = Some(KnownLens::FovX(fov as f32));
+    let options = EstimateOptions { lens, ..EstimateOptions::default() };
+    let (found, _) = estimated_with(&photographs(barrel), &options);
+    assert!(found.straightened.unwrap().k < -0.05, "{:?}", found.straightened);
+    let right = errors(&found.estimate.cameras);
+    assert!(right[0] < 0.3 && right[1] < 1.5, "{right:?}");
+    let (found, _) = estimated_with(&photographs(pinhole), &options);
+    assert_eq!(found.straightened, None);
 }
