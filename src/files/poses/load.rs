@@ -91,9 +91,9 @@ fn with_pictures_counted(mut scene: Scene, path: &Path, reading: &Reading<'_>) -
 }
 
 /// For messages: the pose files of a folder.
-const SCENES: &str = "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, poses.txt with K.txt, or \
-     the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML), RealityCapture (CSV), OpenMVG, Meshroom, \
-     3D Scanner App, MVSNet, NeuS, ScanNet, 7-Scenes, NSVF or NeRF++";
+const SCENES: &str = "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, poses.txt with \
+     K.txt, or the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML), RealityCapture (CSV), \
+     OpenMVG, Meshroom, 3D Scanner App, MVSNet, NeuS, ScanNet, 7-Scenes, NSVF or NeRF++";
 
 /// Reads the pose file or the folder of one that [`SceneOptions::model`] names.
 fn load_model(model: &Path, reading: &Reading<'_>) -> Result<Scene> {

@@ -7,12 +7,12 @@
 //! | NeRF++ | `pose/NAME.txt` | `intrinsics/NAME.txt`, one for each picture | `rgb/NAME.png` |
 //! | 7-Scenes, 3DMatch | `frame-000000.pose.txt` | none, or `camera-intrinsics.txt` | `frame-000000.color.png` |
 //!
-//! Poses are camera-to-world in OpenCV axes: 12 or 16 numbers by rows, on one line or on several. ScanNet has -inf where
-//! the pose of a frame is not known. Intrinsics are a 3×3 or 4×4 matrix by rows in pixels, or NSVF's first line
+//! Poses are camera-to-world in OpenCV axes: 12 or 16 numbers by rows, on one line or on several. ScanNet has -inf
+//! where the pose of a frame is not known. Intrinsics are a 3×3 or 4×4 matrix by rows in pixels, or NSVF's first line
 //! `f cx cy 0` above lines of other content. ScanNet's and 7-Scenes' unit is the metre.
 //!
-//! 7-Scenes states no intrinsics of its colour camera. Its authors call both cameras uncalibrated and name focal length
-//! 585 and centre (320, 240) of the depth camera at 640×480; these are used, with a warning.
+//! 7-Scenes states no intrinsics of its colour camera. Its authors call both cameras uncalibrated and name focal
+//! length 585 and centre (320, 240) of the depth camera at 640×480; these are used, with a warning.
 //!
 //! Sources: ScanNet/ScanNet, `SensReader/python/SensorData.py` (`export_poses`, `export_intrinsics`);
 //! facebookresearch/NSVF, `fairnr/data/data_utils.py` (`load_intrinsics`); Kai-46/nerfplusplus, `README.md`, "Data

@@ -3,15 +3,16 @@
 //! A pose has a rotation of nine numbers by columns, from the world to the camera in OpenCV axes, and the camera's
 //! `center`. By rows the nine numbers are the rotation from the camera to the world. Numbers are texts.
 //!
-//! `version` decides how intrinsics are read. Before 1.2.1 the principal point is from the picture's corner, later from
-//! its middle. Before 1.2.2 the focal length is `pxFocalLength` in pixels, one number or two; later it is `focalLength`
-//! in mm of `sensorWidth`, and fy = fx·`pixelRatio`, before 1.2.5 fx/`pixelRatio`. Before 1.2.8 `type` names the
-//! distortion, later `distortionType`. Distortions read: none, radial K1 and K3, Brown (K1 K2 K3 T1 T2; T1, T2 are OpenCV's
-//! p1, p2) and fisheye (OpenCV's). A view without a pose was not placed. Cameras refer to the stored pixels.
+//! `version` decides how intrinsics are read. Before 1.2.1 the principal point is from the picture's corner, later
+//! from its middle. Before 1.2.2 the focal length is `pxFocalLength` in pixels, one number or two; later it is
+//! `focalLength` in mm of `sensorWidth`, and fy = fx·`pixelRatio`, before 1.2.5 fx/`pixelRatio`. Before 1.2.8 `type`
+//! names the distortion, later `distortionType`. Distortions read: none, radial K1 and K3, Brown (K1 K2 K3 T1 T2; T1,
+//! T2 are OpenCV's p1, p2) and fisheye (OpenCV's). A view without a pose was not placed. Cameras refer to the stored
+//! pixels.
 //!
-//! Source: alicevision/AliceVision, `src/aliceVision/sfmDataIO/jsonIO.hpp` (`saveMatrix` writes Eigen's matrices, which
-//! are stored by columns), `jsonIO.cpp` (`loadIntrinsic`), `camera/cameraCommon.hpp` (names), `camera/Distortion*.cpp`,
-//! `geometry/Pose3.hpp`.
+//! Source: alicevision/AliceVision, `src/aliceVision/sfmDataIO/jsonIO.hpp` (`saveMatrix` writes Eigen's matrices,
+//! which are stored by columns), `jsonIO.cpp` (`loadIntrinsic`), `camera/cameraCommon.hpp` (names),
+//! `camera/Distortion*.cpp`, `geometry/Pose3.hpp`.
 
 use super::assemble::{Draft, Lens, assemble};
 use super::cameras_json::side;

@@ -1,15 +1,15 @@
 //! Cameras of NeuS, IDR and VolSDF (DTU, BlendedMVS): `cameras_sphere.npz` or `cameras.npz`, a zip of NumPy arrays.
 //!
-//! `world_mat_N` is the projection K·[R | t] of the world into picture N, 3×4 or with a fourth row: `scale_mat_N`, which
-//! moves the scene into a sphere, is not applied, so that the cameras keep the world's unit. The pictures lie in `image`,
-//! and picture N is the N-th in the order of Python's `sorted`, that is, by bytes. Masks lie in `mask`.
+//! `world_mat_N` is the projection K·[R | t] of the world into picture N, 3×4 or with a fourth row: `scale_mat_N`,
+//! which moves the scene into a sphere, is not applied, so that the cameras keep the world's unit. The pictures lie
+//! in `image`, and picture N is the N-th in the order of Python's `sorted`, that is, by bytes. Masks lie in `mask`.
 //!
 //! The decomposition: the rows of R come from those of the left 3×3 matrix M, from the last one upwards (Gram and
-//! Schmidt), and the factors are K. A projection is known up to its sign; that of det M makes R a rotation. The position
-//! is −M⁻¹·p, with the fourth column p.
+//! Schmidt), and the factors are K. A projection is known up to its sign; that of det M makes R a rotation. The
+//! position is −M⁻¹·p, with the fourth column p.
 //!
-//! Sources: lioryariv/idr and lioryariv/volsdf, `DATA_CONVENTION.md`; Totoro97/NeuS, `models/dataset.py`; R. Hartley and
-//! A. Zisserman, Multiple View Geometry, 6.2.4.
+//! Sources: lioryariv/idr and lioryariv/volsdf, `DATA_CONVENTION.md`; Totoro97/NeuS, `models/dataset.py`; R. Hartley
+//! and A. Zisserman, Multiple View Geometry, 6.2.4.
 
 use super::assemble::{Draft, Lens, assemble, list_images, scene_name};
 use super::npy;

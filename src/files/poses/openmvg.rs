@@ -1,12 +1,12 @@
 //! OpenMVG's `sfm_data.json`, with poses (`extrinsics`): that of a reconstruction, not the list of photographs.
 //!
-//! A pose is a rotation from the world to the camera, 3×3 by rows in OpenCV axes, and the camera's `center`. Intrinsics
-//! are in pixels. Models read: `pinhole`, `pinhole_radial_k1`, `pinhole_radial_k3`, `pinhole_brown_t2` (K1 K2 K3 T1 T2;
-//! T1, T2 are OpenCV's p1, p2), `fisheye` (OpenCV's) and `spherical` (a picture becomes several frames,
+//! A pose is a rotation from the world to the camera, 3×3 by rows in OpenCV axes, and the camera's `center`.
+//! Intrinsics are in pixels. Models read: `pinhole`, `pinhole_radial_k1`, `pinhole_radial_k3`, `pinhole_brown_t2` (K1
+//! K2 K3 T1 T2; T1, T2 are OpenCV's p1, p2), `fisheye` (OpenCV's) and `spherical` (a picture becomes several frames,
 //! `super::panoramas`). A view without a pose or intrinsics was not placed. Cameras refer to the stored pixels.
 //!
-//! The library cereal writes the name of a model once: `polymorphic_id` has its highest bit set there, and later entries
-//! have the rest of the number alone.
+//! The library cereal writes the name of a model once: `polymorphic_id` has its highest bit set there, and later
+//! entries have the rest of the number alone.
 //!
 //! Sources: openMVG/openMVG, `src/openMVG/geometry/pose3_io.hpp`, `cameras/Camera_*.hpp` and `cameras/*_io.hpp`,
 //! `sfm/sfm_view_io.hpp`; USCiLab/cereal, `include/cereal/types/polymorphic.hpp`.

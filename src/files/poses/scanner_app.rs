@@ -1,9 +1,9 @@
 //! 3D Scanner App (iOS), export "All data": a JSON file of each frame, `frame_00000.json`, with the picture
 //! `frame_00000.jpg` beside it. Not every frame has a picture.
 //!
-//! `cameraPoseARFrame` has 16 numbers, camera-to-world in ARKit's axes (x to the right of the picture as it is stored, y
-//! up, z backward), metres. They are rows; columns too, which the place of 0 0 0 1 shows. `intrinsics` has the 3×3 matrix
-//! by rows or by columns, in pixels of the picture.
+//! `cameraPoseARFrame` has 16 numbers, camera-to-world in ARKit's axes (x to the right of the picture as it is
+//! stored, y up, z backward), metres. They are rows; columns too, which the place of 0 0 0 1 shows. `intrinsics` has
+//! the 3×3 matrix by rows or by columns, in pixels of the picture.
 //!
 //! Sources: exports in public repositories and their readers, which agree (`np.array(…).reshape(4, 4)`, found by the
 //! key); Apple, `ARCamera.transform`.
