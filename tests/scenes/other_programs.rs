@@ -115,7 +115,7 @@ fn broken_cameras_of_mvsnet_are_left_out() {
         write(&at(i), mvsnet_text(&c.camera, "1 1 1 9"));
     }
     let good = std::fs::read_to_string(at(0)).unwrap();
-    write(&at(0), &good[..good.len() / 2]);
+    write(&at(0), &good[..good.find("intrinsic").unwrap() + 15]);
     write(&at(1), good.replacen("0 0 0 1", "0 nan 0 1", 1));
     std::fs::remove_file(folder.path().join("images/004.png")).unwrap();
     let scene = load_scene(folder.path()).unwrap();
@@ -581,7 +581,7 @@ fn neus_is_read() {
     let Distortion::Polynomial { skew, .. } = scene.frames[1].distortion else {
         panic!("{:?}", scene.frames[1].distortion)
     };
-    assert!((skew - 0.02).abs() < 1e-9, "{skew}");
+    assert!((skew - 0.02).abs() < 1e-6, "{skew}");
 }
 
 #[test]
