@@ -329,7 +329,7 @@ fn of_reconstructions(folder: &Path) -> Vec<(PoseFile, &'static str)> {
         all.push((PoseFile::MvsNet(cameras), "MVSNet"));
     }
     let paths = neus::NAMES.map(|name| folder.join(name));
-    if let Some(path) = paths.into_iter().find(|path| path.is_file()) {
+    if let Some(path) = paths.into_iter().find(|path| neus::count(path) > 0) {
         all.push((PoseFile::Neus(path), "NeuS"));
     }
     if matrix_files::is_scene(folder) {

@@ -71,6 +71,44 @@ impl Layout {
     fn is_7_scenes(&self) -> bool {
         self.pose == POSE
     }
+
+    /// The file with the intrinsics of all pictures.
+    fn intrinsics(&self, folder: &Path) -> Option<PathBuf> {
+        let in_folder = |base: &Path| INTRINSICS.map(|name| base.join(name)).into_iter();
+        let own = in_folder(folder).find(|file| file.is_file());
+        // A sequence of 7-Scenes and 3DMatch lies in a folder of its own, below that of the intrinsics.
+        let above = folder.parent().filter(|_| self.is_7_scenes());
+        own.or_else(|| in_folder(above?).find(|file| file.is_file()))
+    }
+}
+
+/// Intrinsics of the pictures of a scene.
+struct Lenses {
+    /// Folder of the files for one picture each.
+    of_each: PathBuf,
+    /// Those of all pictures.
+    shared: Option<[f64; 4]>,
+    /// Those that the data set's authors name, with the size of its pictures.
+    stated: Option<([f64; 4], (usize, usize))>,
+}
+
+impl Lenses {
+    /// Intrinsics of the picture of a pose `name`, and the size to which they belong where it is known.
+    fn of(&self, name: &str) -> Result<([f64; 4], Option<(usize, usize)>)> {
+        let own = self.of_each.join(format!("{name}.txt"));
+        if own.is_file() {
+            return Ok((intrinsics(&own)?, None));
+        }
+        match (self.shared, self.stated) {
+            (Some(k), _) => Ok((k, None)),
+            (None, Some((k, size))) => Ok((k, Some(size))),
+            (None, None) => Err(Error::format(own, "intrinsics of this picture", "no such file")),
+        }
+    }
+
+    fn are_missing(&self) -> bool {
+        self.shared.is_none() && self.stated.is_none() && !self.of_each.is_dir()
+    }
 }
 
 /// Number of poses in `folder` where it has a folder of pictures; 0 where it is none of these layouts.
@@ -90,50 +128,29 @@ pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let Some(layout) = Layout::of(folder) else {
         return Err(Error::format(folder, "pose/NAME.txt or NAME.pose.txt of a matrix", "none"));
     };
-    let above = folder.parent().unwrap_or(folder);
-    let shared =
-        [folder, above].into_iter().flat_map(|base| INTRINSICS.map(|name| base.join(name)));
-    // A sequence of 7-Scenes and 3DMatch lies in a folder of its own, below that of the intrinsics.
-    let shared =
-        shared.take(if layout.is_7_scenes() { 2 * INTRINSICS.len() } else { INTRINSICS.len() });
-    let shared = shared.into_iter().find(|file| file.is_file());
-    let k = shared.as_deref().map(intrinsics).transpose()?;
-    let stated = layout.is_7_scenes().then_some(KINECT);
-    let of_each = folder.join("intrinsics");
-    if k.is_none() && stated.is_none() && !of_each.is_dir() {
+    let shared = layout.intrinsics(folder);
+    let lenses = Lenses {
+        of_each: folder.join("intrinsics"),
+        shared: shared.as_deref().map(intrinsics).transpose()?,
+        stated: layout.is_7_scenes().then_some(KINECT),
+    };
+    if lenses.are_missing() {
         let expected = "intrinsics of the pictures in intrinsics.txt (3x3 or 4x4), in intrinsics/NAME.txt or in \
                         intrinsic/intrinsic_color.txt";
         return Err(Error::format(folder, expected, "none"));
     }
     let places = reading.places(PICTURES.iter().map(|name| folder.join(name)).collect());
     let places: Vec<&Path> = places.iter().map(PathBuf::as_path).collect();
-    let draft = |file: &Path, name: &str| -> Result<Draft> {
-        let matrix = parse_matrix(&text(file)?)
-            .map_err(|got| Error::format(file, "a pose of 12 or 16 numbers", got))?;
-        if !matrix.is_finite() {
-            let expected = "a pose of finite numbers, which a frame has whose pose is known";
-            return Err(Error::format(file, expected, "numbers that are not finite"));
-        }
-        let own = of_each.join(format!("{name}.txt"));
-        let own = own.is_file().then(|| intrinsics(&own)).transpose()?;
-        let (k, size) = match (own.or(k), stated) {
-            (Some(k), _) => (k, None),
-            (None, Some((k, size))) => (k, Some(size)),
-            (None, None) => {
-                let expected = format!("intrinsics of this picture in intrinsics/{name}.txt");
-                return Err(Error::format(file, expected, "none"));
-            }
-        };
-        let pose = reading.pose(matrix, PoseConvention::WorldFromCameraOpenCv);
-        let picture = format!("{name}{}", layout.picture);
-        let image = reading.find_exact(&places, &picture);
-        let draft = Draft::new(format!(" frame {name}"), picture, Lens::Pixels(k), pose);
-        Ok(Draft { image, size, ..draft })
-    };
     let drafts = layout.files().into_iter().map(|file| {
         let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let name = name.trim_end_matches(layout.pose);
-        draft(&file, name).unwrap_or_else(|error| Draft::refused(name.to_owned(), error))
+        let name = name.strip_suffix(layout.pose).unwrap_or(&name);
+        let picture = format!("{name}{}", layout.picture);
+        match draft(&file, name, &lenses, reading) {
+            Ok(draft) => {
+                Draft { image: reading.find_exact(&places, &picture), file: picture, ..draft }
+            }
+            Err(error) => Draft::refused(picture, error),
+        }
     });
     let drafts = drafts.collect();
     let mut scene = assemble(&layout.poses, SceneFormat::MatrixFiles, &reading.needed(), drafts)?;
@@ -141,9 +158,7 @@ pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     if layout.is_7_scenes() || shared.is_some_and(|file| file.ends_with(SCANNET)) {
         scene.units = Units::Metres;
     }
-    if k.is_none()
-        && let Some(([focal, ..], _)) = stated
-    {
+    if let (None, Some(([focal, ..], _))) = (lenses.shared, lenses.stated) {
         scene.warnings.push(format!(
             "{}: no intrinsics: the focal length is {focal} px at 640x480, which the authors of 7-Scenes name for the \
              depth camera of a Kinect; a 3x3 matrix in intrinsics.txt there takes precedence",
@@ -151,6 +166,19 @@ pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
         ));
     }
     Ok(scene)
+}
+
+fn draft(file: &Path, name: &str, lenses: &Lenses, reading: &Reading<'_>) -> Result<Draft> {
+    let matrix = parse_matrix(&text(file)?)
+        .map_err(|got| Error::format(file, "a pose of 12 or 16 numbers", got))?;
+    if !matrix.is_finite() {
+        let expected = "a pose of finite numbers, which a frame has whose pose is known";
+        return Err(Error::format(file, expected, "numbers that are not finite"));
+    }
+    let (k, size) = lenses.of(name)?;
+    let pose = reading.pose(matrix, PoseConvention::WorldFromCameraOpenCv);
+    let draft = Draft::new(format!(" frame {name}"), String::new(), Lens::Pixels(k), pose);
+    Ok(Draft { size, ..draft })
 }
 
 /// fx, fy, cx, cy of a file.

@@ -133,7 +133,7 @@ pub(super) fn load(cameras: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let mut range: Option<NearFar> = None;
     let drafts = in_folder(cameras).into_iter().map(|file| {
         let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let name = name.trim_end_matches(ENDING).to_owned();
+        let name = name.strip_suffix(ENDING).unwrap_or(&name).to_owned();
         let camera = match read(&file).and_then(|bytes| parse(&file, &bytes)) {
             Ok(camera) => camera,
             Err(error) => return Draft::refused(name, error),
