@@ -363,6 +363,10 @@ fn broken_views_of_openmvg_are_left_out() {
     write(&path, &text[..text.len() / 2]);
     refused("cut", load_scene(&path), &["sfm_data.json"]);
     assert!(!is_scene(folder.path()));
+    // A list of photographs is no scene.
+    file["extrinsics"] = json!([]);
+    write(&path, file.to_string());
+    assert!(!is_scene(folder.path()));
 }
 
 /// A panorama of OpenMVG becomes several frames.
@@ -509,6 +513,7 @@ fn broken_views_of_meshroom_are_left_out() {
     // A list of photographs is no scene.
     file["poses"] = json!([]);
     write(&path, file.to_string());
+    std::fs::copy(&path, folder.path().join("photographs.json")).unwrap();
     assert!(!is_scene(folder.path()));
 }
 
@@ -600,11 +605,11 @@ fn hostile_archives_of_neus() {
     write(&path, npz(&broken));
     let scene = load_scene(folder.path()).unwrap();
     check(&scene, SceneFormat::Neus, &cameras[2..]);
-    left_out(&scene, &[(0, "finite"), (1, "(16, 1)")]);
+    left_out(&scene, &[(0, "a projection K"), (1, "(16, 1)")]);
     // No rotation: the rows of M lie in a plane.
     broken[3].1 = npy("'<f8'", "(3, 4)", &[1.0; 12]);
     write(&path, npz(&broken));
-    left_out(&load_scene(folder.path()).unwrap(), &[(0, "finite"), (1, "finite")]);
+    left_out(&load_scene(folder.path()).unwrap(), &[(0, "a projection K"), (1, "a projection K")]);
     refused("one missing", neus::parse("a.npz", &npz(&arrays[2..])), &["world_mat_0.npy", "3 of"]);
     refused("none", neus::parse("a.npz", &npz(&[])), &["world_mat_0.npy", "0 of"]);
     std::fs::remove_file(folder.path().join("images/002.png")).unwrap();

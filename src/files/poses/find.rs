@@ -398,6 +398,10 @@ fn any_json(folder: &Path) -> Option<PoseFile> {
 fn kind_of_json(path: &Path) -> Option<PoseFile> {
     match foreign_json(path) {
         Some(PoseFile::Nerfstudio(_)) => return None,
+        // A list of photographs.
+        Some(file @ (PoseFile::OpenMvg(_) | PoseFile::Meshroom(_))) if file.cameras() == 0 => {
+            return None;
+        }
         Some(file) => return Some(file),
         None => {}
     }
