@@ -36,9 +36,18 @@ const INTRINSICS: [&str; 5] =
 /// End of the name of a pose of 7-Scenes.
 pub(super) const POSE: &str = ".pose.txt";
 /// Intrinsics that 7-Scenes' authors name, and the size of their pictures.
-const KINECT: ([f64; 4], (usize, usize)) = ([585.0, 585.0, 320.0, 240.0], (640, 480));
+const KINECT: Optics = Optics { k: [585.0, 585.0, 320.0, 240.0], size: Some((640, 480)) };
 /// Longest pose file, bytes.
 const POSE_MAX: usize = 4096;
+
+/// Intrinsics of a picture.
+#[derive(Clone, Copy)]
+struct Optics {
+    /// fx, fy, cx, cy, px.
+    k: [f64; 4],
+    /// Size to which they belong; `None` for that of the picture on disk.
+    size: Option<(usize, usize)>,
+}
 
 /// Folder of the poses of a scene, and the names of poses and pictures.
 struct Layout {
@@ -87,23 +96,20 @@ struct Lenses {
     /// Folder of the files for one picture each.
     of_each: PathBuf,
     /// Those of all pictures.
-    shared: Option<[f64; 4]>,
-    /// Those that the data set's authors name, with the size of its pictures.
-    stated: Option<([f64; 4], (usize, usize))>,
+    shared: Option<Optics>,
+    /// Those that the data set's authors name.
+    stated: Option<Optics>,
 }
 
 impl Lenses {
-    /// Intrinsics of the picture of a pose `name`, and the size to which they belong where it is known.
-    fn of(&self, name: &str) -> Result<([f64; 4], Option<(usize, usize)>)> {
+    /// Intrinsics of the picture of a pose `name`.
+    fn of(&self, name: &str) -> Result<Optics> {
         let own = self.of_each.join(format!("{name}.txt"));
         if own.is_file() {
-            return Ok((intrinsics(&own)?, None));
+            return intrinsics(&own);
         }
-        match (self.shared, self.stated) {
-            (Some(k), _) => Ok((k, None)),
-            (None, Some((k, size))) => Ok((k, Some(size))),
-            (None, None) => Err(Error::format(own, "intrinsics of this picture", "no such file")),
-        }
+        let expected = || Error::format(own, "intrinsics of this picture", "no such file");
+        self.shared.or(self.stated).ok_or_else(expected)
     }
 
     fn are_missing(&self) -> bool {
@@ -158,7 +164,7 @@ pub(super) fn load(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     if layout.is_7_scenes() || shared.is_some_and(|file| file.ends_with(SCANNET)) {
         scene.units = Units::Metres;
     }
-    if let (None, Some(([focal, ..], _))) = (lenses.shared, lenses.stated) {
+    if let (None, Some(Optics { k: [focal, ..], .. })) = (lenses.shared, lenses.stated) {
         scene.warnings.push(format!(
             "{}: no intrinsics: the focal length is {focal} px at 640x480, which the authors of 7-Scenes name for the \
              depth camera of a Kinect; a 3x3 matrix in intrinsics.txt there takes precedence",
@@ -175,14 +181,14 @@ fn draft(file: &Path, name: &str, lenses: &Lenses, reading: &Reading<'_>) -> Res
         let expected = "a pose of finite numbers, which a frame has whose pose is known";
         return Err(Error::format(file, expected, "numbers that are not finite"));
     }
-    let (k, size) = lenses.of(name)?;
+    let Optics { k, size } = lenses.of(name)?;
     let pose = reading.pose(matrix, PoseConvention::WorldFromCameraOpenCv);
     let draft = Draft::new(format!(" frame {name}"), String::new(), Lens::Pixels(k), pose);
     Ok(Draft { size, ..draft })
 }
 
-/// fx, fy, cx, cy of a file.
-fn intrinsics(file: &Path) -> Result<[f64; 4]> {
+/// Intrinsics of a file.
+fn intrinsics(file: &Path) -> Result<Optics> {
     let text = text(file)?;
     let first: Vec<&str> = text.lines().next().unwrap_or("").split_ascii_whitespace().collect();
     let found = match (parse_intrinsics(&text), first.as_slice()) {
@@ -193,5 +199,8 @@ fn intrinsics(file: &Path) -> Result<[f64; 4]> {
         }
         (Err(got), _) => Err(got),
     };
-    found.map_err(|got| Error::format(file, "an intrinsic matrix of 3x3 or 4x4, or f cx cy 0", got))
+    let k = found.map_err(|got| {
+        Error::format(file, "an intrinsic matrix of 3x3 or 4x4, or f cx cy 0", got)
+    })?;
+    Ok(Optics { k, size: None })
 }
