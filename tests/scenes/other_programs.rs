@@ -79,7 +79,7 @@ fn mvsnet_is_read() {
     let at = |name: &str| folder.path().join(name);
     let file = |i: usize| at(&format!("cams/{i:08}_cam.txt"));
     let put = |i: usize, depths: &str| write(&file(i), mvsnet_text(&cameras[i].camera, depths));
-    let depths = ["1.5 0.1 192 20.5", "0.5 0.1 10 30", "2 0.1", "-1 0.1 10 90", ""];
+    let depths = ["1.5 0.1 192 20.5", "0.5 0.25 118", "2 0.1", "-1 0.1 10 90", ""];
     depths.iter().enumerate().for_each(|(i, depths)| put(i, depths));
     write(&at("cams/pair.txt"), "5\n0\n1 1 3.5\n");
     let scene = load_scene(folder.path()).unwrap();
@@ -339,7 +339,7 @@ fn openmvg_is_read() {
 
 #[test]
 fn broken_views_of_openmvg_are_left_out() {
-    let (folder, cameras) = plain(7);
+    let (folder, cameras) = plain(8);
     let path = folder.path().join("sfm_data.json");
     let mut file = openmvg(&cameras, &|_| ("pinhole", Value::Null));
     file["extrinsics"][0]["key"] = json!(99);
@@ -348,15 +348,19 @@ fn broken_views_of_openmvg_are_left_out() {
     file["intrinsics"][3]["value"]["polymorphic_name"] = json!("omnidirectional");
     file["intrinsics"][3]["value"]["polymorphic_id"] = json!(2147483650u32);
     file["intrinsics"][4]["value"]["ptr_wrapper"]["data"]["principal_point"] = json!([1]);
+    // A panorama, whose world is mirrored.
+    file["intrinsics"][5]["value"]["polymorphic_name"] = json!("spherical");
+    file["intrinsics"][5]["value"]["polymorphic_id"] = json!(2147483651u32);
     write(&path, file.to_string());
     let scene = load_scene(folder.path()).unwrap();
-    check(&scene, SceneFormat::OpenMvg, &cameras[5..]);
+    check(&scene, SceneFormat::OpenMvg, &cameras[6..]);
     let reasons = [
         (0, "a pose"),
         (1, "a center of three"),
         (2, "NaN"),
         (3, "`omnidirectional`"),
         (4, "principal_point of 2"),
+        (5, "`spherical`"),
     ];
     left_out(&scene, &reasons);
     let text = file.to_string();
@@ -367,22 +371,6 @@ fn broken_views_of_openmvg_are_left_out() {
     file["extrinsics"] = json!([]);
     write(&path, file.to_string());
     assert!(!is_scene(folder.path()));
-}
-
-/// A panorama of OpenMVG becomes several frames.
-#[test]
-fn panoramas_of_openmvg_are_read() {
-    let (folder, cameras) = plain(2);
-    let mut file = openmvg(&cameras, &|_| ("spherical", Value::Null));
-    for i in 0..2 {
-        save_png(folder.path().join(&cameras[i].file), &noise(128, 64)).unwrap();
-        // The size of the base class.
-        let data = json!({ "value0": { "width": 128, "height": 64 } });
-        file["intrinsics"][i]["value"]["ptr_wrapper"]["data"] = data;
-    }
-    write(&folder.path().join("sfm_data.json"), file.to_string());
-    let scene = load_scene(folder.path()).unwrap();
-    assert!(scene.frames.len() > 2 && scene.frames.iter().all(|frame| frame.cut.is_some()));
 }
 
 /// Meshroom's file of a version, with every number as a text.

@@ -2,12 +2,12 @@
 //! picture, `cams/00000000_cam.txt`.
 //!
 //! The word `extrinsic` and a 4×4 matrix by rows, world-to-camera in OpenCV axes; the word `intrinsic` and a 3×3
-//! matrix in pixels of the picture; a line of depths: the nearest one and the interval of the planes, or with the
-//! number of planes and the farthest depth after them. Two numbers are no range: the number of planes is a parameter
+//! matrix in pixels of the picture; a line of depths: the nearest one, the interval of the planes, their number, and
+//! the farthest depth. The last one or two may be missing. Without the number the line is no range: it is a parameter
 //! of the network. The picture has the number of the camera as its name.
 //!
-//! Sources: YoYo000/MVSNet, `README.md`, "Camera Files" (two depths) and `mvsnet/preprocess.py` (`load_cam`: four
-//! depths); YoYo000/BlendedMVS, `README.md` (`blended_images`; a nearest depth may be below zero).
+//! Sources: YoYo000/MVSNet, `README.md`, "Camera Files", and `mvsnet/preprocess.py` (`load_cam`: two, three
+//! or four depths); YoYo000/BlendedMVS, `README.md` (`blended_images`; a nearest depth may be below zero).
 
 use super::assemble::{Draft, Lens, assemble, files};
 use super::json::utf8;
@@ -61,6 +61,7 @@ fn camera(path: &Path, bytes: &[u8]) -> Result<MvsNetCamera> {
     let depths: Vec<f64> = words.map_while(|word| word.parse().ok()).collect();
     let near_far = match *depths.as_slice() {
         [near, _, _, far, ..] => Some(NearFar::new(near as f32, far as f32)),
+        [near, step, planes] => Some(NearFar::new(near as f32, (near + step * planes) as f32)),
         _ => None,
     };
     Ok(MvsNetCamera {

@@ -2,8 +2,9 @@
 //!
 //! A pose is a rotation from the world to the camera, 3×3 by rows in OpenCV axes, and the camera's `center`.
 //! Intrinsics are in pixels. Models read: `pinhole`, `pinhole_radial_k1`, `pinhole_radial_k3`, `pinhole_brown_t2` (K1
-//! K2 K3 T1 T2; T1, T2 are OpenCV's p1, p2), `fisheye` (OpenCV's) and `spherical` (a picture becomes several frames,
-//! `super::panoramas`). A view without a pose or intrinsics was not placed. Cameras refer to the stored pixels.
+//! K2 K3 T1 T2; T1, T2 are OpenCV's p1, p2) and `fisheye` (OpenCV's). `spherical` is not read: its axes are x right, y
+//! up, z forward, so that the world is mirrored. A view without a pose or intrinsics was not placed. Cameras refer to
+//! the stored pixels.
 //!
 //! The library cereal writes the name of a model once: `polymorphic_id` has its highest bit set there, and later
 //! entries have the rest of the number alone.
@@ -17,7 +18,6 @@ use super::json;
 use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
 use crate::files::photos::distortion::Distortion;
-use crate::files::photos::views::panorama_intrinsics;
 use crate::files::{Error, Result, read};
 use glam::{DMat3, DMat4, DVec3};
 use serde::Deserialize;
@@ -33,8 +33,8 @@ pub(super) const FILES: [&str; 4] = [
     "reconstruction_sequential/sfm_data.json",
     "reconstruction_global/sfm_data.json",
 ];
-const MODELS_READ: &str = "a model among pinhole, pinhole_radial_k1, pinhole_radial_k3, \
-                           pinhole_brown_t2, fisheye, spherical";
+const MODELS_READ: &str =
+    "a model among pinhole, pinhole_radial_k1, pinhole_radial_k3, pinhole_brown_t2, fisheye";
 /// Bit of a `polymorphic_id` that a name follows.
 const NAMED: u64 = 1 << 31;
 
@@ -104,11 +104,6 @@ pub(super) fn count(path: &Path) -> usize {
     outline.map_or(0, |o| if o.views.is_empty() { 0 } else { o.extrinsics.len() })
 }
 
-/// The value `key` of an object, or of the base class in it.
-fn field<'a>(data: &'a Value, key: &str) -> &'a Value {
-    data.get(key).unwrap_or(&data["value0"][key])
-}
-
 /// Size, intrinsics and distortion of a camera.
 #[derive(Clone)]
 struct Camera {
@@ -119,12 +114,12 @@ struct Camera {
 
 /// The camera of an entry with its model; errors are what is expected and what is found.
 fn camera(model: &str, data: &Value) -> std::result::Result<Camera, (String, String)> {
-    let [w, h] = ["width", "height"].map(|key| field(data, key).as_f64().and_then(side));
+    let [w, h] = ["width", "height"].map(|key| data[key].as_f64().and_then(side));
     let (Some(w), Some(h)) = (w, h) else {
         return Err(("width and height in whole pixels".to_owned(), "none".to_owned()));
     };
     let list = |key: &str| -> Vec<f64> {
-        let values = field(data, key).as_array().into_iter().flatten();
+        let values = data[key].as_array().into_iter().flatten();
         values.map(|value| value.as_f64().unwrap_or(f64::NAN)).collect()
     };
     let several = |key: &str, count: usize| {
@@ -150,17 +145,12 @@ fn camera(model: &str, data: &Value) -> std::result::Result<Camera, (String, Str
             let k = several("fisheye", 4)?;
             Distortion::fisheye([k[0], k[1], k[2], k[3]])
         }
-        "spherical" => Distortion::Equirectangular,
         other => return Err((MODELS_READ.to_owned(), format!("`{other}`"))),
     };
-    let lens = if distortion == Distortion::Equirectangular {
-        panorama_intrinsics(w as f64, h as f64)
-    } else {
-        let focal = field(data, "focal_length").as_f64();
-        let focal = focal.ok_or_else(|| ("focal_length".to_owned(), "none".to_owned()))?;
-        let center = several("principal_point", 2)?;
-        [focal, focal, center[0], center[1]]
-    };
+    let focal = data["focal_length"].as_f64();
+    let focal = focal.ok_or_else(|| ("focal_length".to_owned(), "none".to_owned()))?;
+    let center = several("principal_point", 2)?;
+    let lens = [focal, focal, center[0], center[1]];
     Ok(Camera { size: (w, h), lens: Lens::Pixels(lens), distortion })
 }
 
@@ -197,7 +187,7 @@ pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let roots = if root_path.is_empty() { &roots[1..] } else { &roots[..] };
     let drafts = views.into_iter().map(|Entry { key, value }| {
         let data = value.ptr_wrapper.data;
-        let text = |key: &str| field(&data, key).as_str().unwrap_or_default().to_owned();
+        let text = |key: &str| data[key].as_str().unwrap_or_default().to_owned();
         let (local, file) = (text("local_path"), text("filename"));
         let name = if local.is_empty() { file } else { format!("{local}/{file}") };
         match draft(path, key, &name, &data, &cameras, &poses) {
@@ -230,7 +220,7 @@ fn draft(
 ) -> Result<Draft> {
     let place = format!(" view {key}");
     let bad = |expected: &str, got: String| Error::format(path, expected, got).at(&place);
-    let id = |key: &str| field(data, key).as_u64();
+    let id = |key: &str| data[key].as_u64();
     let Some(pose) = id("id_pose").and_then(|id| poses.get(&id)) else {
         return Err(bad("a pose, which a view that OpenMVG placed has", "none".to_owned()));
     };

@@ -5,8 +5,8 @@
 //! stored, y up, z backward), metres. They are rows; columns too, which the place of 0 0 0 1 shows. `intrinsics` has
 //! the 3×3 matrix by rows or by columns, in pixels of the picture.
 //!
-//! Sources: exports in public repositories and their readers, which agree (`np.array(…).reshape(4, 4)`, found by the
-//! key); Apple, `ARCamera.transform`.
+//! Sources: PSegs, `psegs/datasets/ios_lidar.py` (rows, OpenGL's axes as rtabmap has them), and other public readers of
+//! these files, which agree on the rows; Apple, `ARCamera.transform`.
 
 use super::assemble::{Draft, Lens, assemble, files, scene_name};
 use super::json;
