@@ -9,6 +9,7 @@
 //! Foreign conventions end here and in the network's `model/primaries.rs`. Every binary reader has a `parse_*` of
 //! bytes, which tests and fuzz targets call.
 
+mod archive;
 pub mod photos;
 pub mod poses;
 pub mod splats;

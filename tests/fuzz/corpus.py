@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Archives of the corpus: one .zip for each fuzz target, so that thousands of files are 37.
+"""Archives of the corpus: one .zip for each fuzz target, so that thousands of files are 43.
 
     tests/fuzz/corpus.py unpack TARGET FOLDER    the committed inputs, as files
     tests/fuzz/corpus.py pack TARGET FOLDER      the files of a folder, as the committed inputs

@@ -10,6 +10,7 @@ mod metrics;
 mod navigation;
 mod options;
 mod other_paths;
+mod other_programs;
 mod photographs;
 mod properties;
 mod resize;

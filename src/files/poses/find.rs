@@ -8,19 +8,25 @@
 //! 3. a RealEstate10K txt
 //! 4. `poses.txt` with `K.txt`
 //! 5. the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML) and RealityCapture (CSV)
-//! 6. a list of `ns-export cameras` where the pictures state their focal lengths
-//! 7. a JSON file of any other name with the content of one of the files above
+//! 6. those of OpenMVG, Meshroom, 3D Scanner App, MVSNet, NeuS, and a matrix file of each picture (ScanNet, 7-Scenes,
+//!    NSVF, NeRF++)
+//! 7. a list of `ns-export cameras` where the pictures state their focal lengths
+//! 8. a JSON file of any other name with the content of one of the files above
+//!
+//! `not_read.rs` names cameras in other layouts.
 
 use super::assemble::{entries, files};
+pub use super::not_read::not_read;
 use super::{
-    bundler, colmap, llff, metashape, nerfstudio, opensfm, polycam, re10k, reality_capture,
+    bundler, colmap, llff, matrix_files, meshroom, metashape, mvsnet, nerfstudio, neus, openmvg,
+    opensfm, polycam, re10k, reality_capture, scanner_app,
 };
 use crate::files::photos::photograph::list_photographs;
 use crate::files::{Result, lower_extension, read};
 use std::path::{Path, PathBuf};
 
 /// JSON files with cameras, in the order of preference; the others are parts of the same scene.
-const JSON_FILES: [&str; 6] = [
+pub(super) const JSON_FILES: [&str; 6] = [
     "cameras.json",
     "transforms.json",
     "transforms_train.json",
@@ -30,21 +36,14 @@ const JSON_FILES: [&str; 6] = [
 ];
 /// Folders in which COLMAP models may lie, themselves or in numbered folders of theirs.
 const MODEL_FOLDERS: [&str; 4] = ["sparse", "colmap/sparse", "", "dense"];
-/// Cameras in layouts that are not read: file or folder, and its maker.
-const NOT_READ: [(&str, &str); 2] = [
-    ("camera_path.json", "a path of nerfstudio's viewer, which has no photographs"),
-    ("project.files", "a Metashape project"),
-];
-/// Projects whose cameras are read when their program has exported them: extension, maker and export.
-const PROJECTS: [[&str; 3]; 3] = [
-    ["psx", "a Metashape project", "XML"],
-    ["rcproj", "a RealityCapture project", "CSV"],
-    ["rsproj", "a RealityScan project", "CSV"],
-];
 /// Files of Bundler, from the folder of the scene.
 const BUNDLER_FILES: [&str; 3] = ["bundle.out", "bundle/bundle.out", "bundler/bundle.out"];
 /// Files of OpenSfM, from the folder of the scene: its own, and OpenDroneMap's.
 const OPENSFM_FILES: [&str; 2] = ["reconstruction.json", "opensfm/reconstruction.json"];
+/// Files of Meshroom, from the folder of the scene, before any other with its extension.
+const MESHROOM_FILES: [&str; 2] = ["cameras.sfm", "sfm.json"];
+/// Folder of Meshroom's reconstructions, each in a folder of its own, from the folder of its project.
+const MESHROOM_CACHE: &str = "MeshroomCache/StructureFromMotion";
 /// Most JSON files of any name that are read in search of cameras, and the size of the largest, bytes.
 const JSON_MAX: (usize, u64) = (40, 1 << 26);
 /// Most folders that are searched one level below.
@@ -82,6 +81,18 @@ pub(super) enum PoseFile {
     RealityCapture(PathBuf),
     /// List or path of nerfstudio.
     Nerfstudio(PathBuf),
+    /// `sfm_data.json` of OpenMVG.
+    OpenMvg(PathBuf),
+    /// Scene of Meshroom.
+    Meshroom(PathBuf),
+    /// Folder of 3D Scanner App.
+    ScannerApp(PathBuf),
+    /// Folder of MVSNet's cameras.
+    MvsNet(PathBuf),
+    /// Archive of NeuS.
+    Neus(PathBuf),
+    /// Folder with a matrix file of each picture.
+    MatrixFiles(PathBuf),
 }
 
 impl PoseFile {
@@ -99,6 +110,12 @@ impl PoseFile {
             Self::Llff(path) => llff::count(path),
             Self::Metashape(path) => metashape::count(path),
             Self::RealityCapture(path) => reality_capture::count(path),
+            Self::OpenMvg(path) => openmvg::count(path),
+            Self::Meshroom(path) => meshroom::count(path),
+            Self::ScannerApp(folder) => scanner_app::count(folder),
+            Self::MvsNet(folder) => mvsnet::count(folder),
+            Self::Neus(path) => neus::count(path),
+            Self::MatrixFiles(folder) => matrix_files::count(folder),
             Self::Nerfstudio(path) => {
                 cameras_of_json(path, true).unwrap_or_else(|| length_of(path, "camera_path"))
             }
@@ -114,6 +131,8 @@ impl PoseFile {
             Self::OpenSfm(path) | Self::Polycam(path) | Self::Record3d(path) => path,
             Self::Bundler(path) | Self::Llff(path) | Self::Nerfstudio(path) => path,
             Self::Metashape(path) | Self::RealityCapture(path) | Self::ColmapText(path) => path,
+            Self::OpenMvg(path) | Self::Meshroom(path) | Self::ScannerApp(path) => path,
+            Self::MvsNet(path) | Self::Neus(path) | Self::MatrixFiles(path) => path,
         }
     }
 }
@@ -197,34 +216,6 @@ pub(super) fn find_in(folder: &Path) -> Result<Option<Found>> {
     Ok(Some(chosen(folder, first, others, worth_a_line)))
 }
 
-/// A line about cameras in `folder` in a layout that is not read.
-pub fn not_read(folder: impl AsRef<Path>) -> Option<String> {
-    cameras_not_read(folder.as_ref())
-}
-
-fn cameras_not_read(folder: &Path) -> Option<String> {
-    let is_list = |file: &str| super::json::is_list(&read(folder.join(file)).unwrap_or_default());
-    let there = NOT_READ
-        .iter()
-        .find(|(path, _)| folder.join(path).exists())
-        .map(|(path, maker)| format!("{path} ({maker})"));
-    let of_project = |path: PathBuf| {
-        let extension = lower_extension(&path);
-        let [_, maker, export] = PROJECTS.into_iter().find(|[own, ..]| *own == extension)?;
-        Some((path, maker, export))
-    };
-    if let Some((path, maker, export)) = files(folder).into_iter().find_map(of_project) {
-        return Some(format!("{} is {maker}: export its cameras as {export}", path.display()));
-    }
-    let list = JSON_FILES[1..].iter().find(|file| is_list(file));
-    let list = list.map(|file| format!("{file} (a list of poses without focal lengths)"));
-    let cameras = list.or(there)?;
-    Some(format!(
-        "{}: cameras in {cameras} are not read: export them as COLMAP or as transforms.json",
-        folder.display()
-    ))
-}
-
 /// Reports whether `subsplat run` wrote the folder: its pictures are rendered, not photographs.
 pub fn is_own_output(folder: impl AsRef<Path>) -> bool {
     let (file, words) = OWN_REPORT;
@@ -306,10 +297,43 @@ fn foreign(folder: &Path) -> Vec<(PoseFile, &'static str)> {
     all.extend(exports.into_iter().map(|file| (file, "Metashape")));
     let tables = by_content(folder, "csv", reality_capture::is_table, PoseFile::RealityCapture);
     all.extend(tables.into_iter().map(|file| (file, "RealityCapture")));
+    all.extend(of_reconstructions(folder));
     let lists = JSON_FILES[1..].iter().map(|name| folder.join(name));
     let mut lists = lists.filter(|path| is_kind(path, &PoseFile::Nerfstudio));
     if let Some(path) = lists.find(|path| nerfstudio::has_focal_lengths(path)) {
         all.push((PoseFile::Nerfstudio(path), "nerfstudio"));
+    }
+    all
+}
+
+/// Cameras of OpenMVG, Meshroom, 3D Scanner App, MVSNet, NeuS and of matrix files, each with the name of its kind.
+fn of_reconstructions(folder: &Path) -> Vec<(PoseFile, &'static str)> {
+    let mut all = Vec::new();
+    let paths = openmvg::FILES.map(|name| folder.join(name));
+    if let Some(path) = paths.into_iter().find(|path| openmvg::count(path) > 0) {
+        all.push((PoseFile::OpenMvg(path), "OpenMVG"));
+    }
+    let paths = MESHROOM_FILES.map(|name| folder.join(name));
+    let named = paths.into_iter().find(|path| meshroom::has_cameras(path)).map(PoseFile::Meshroom);
+    let below = folders(folder.join(MESHROOM_CACHE));
+    let scenes = std::iter::once(folder).chain(below.iter().map(PathBuf::as_path));
+    let scenes =
+        scenes.flat_map(|f| by_content(f, "sfm", meshroom::has_cameras, PoseFile::Meshroom));
+    let scenes: Vec<PoseFile> =
+        scenes.filter(|scene| named.as_ref().is_none_or(|named| named != scene)).collect();
+    all.extend(named.into_iter().chain(scenes).map(|file| (file, "Meshroom")));
+    if scanner_app::count(folder) > 0 {
+        all.push((PoseFile::ScannerApp(folder.to_owned()), "3D Scanner App"));
+    }
+    if let Some(cameras) = mvsnet::cameras_of(folder) {
+        all.push((PoseFile::MvsNet(cameras), "MVSNet"));
+    }
+    let paths = neus::NAMES.map(|name| folder.join(name));
+    if let Some(path) = paths.into_iter().find(|path| neus::count(path) > 0) {
+        all.push((PoseFile::Neus(path), "NeuS"));
+    }
+    if matrix_files::is_scene(folder) {
+        all.push((PoseFile::MatrixFiles(folder.to_owned()), "matrix files"));
     }
     all
 }
@@ -336,7 +360,7 @@ fn is_kind(path: &Path, make: &dyn Fn(PathBuf) -> PoseFile) -> bool {
     path.is_file() && foreign_json(path) == Some(make(path.to_owned()))
 }
 
-/// The kind of a JSON file of OpenSfM, Record3D or nerfstudio's exports, by content.
+/// The kind of a JSON file of OpenSfM, OpenMVG, Meshroom, Record3D or nerfstudio's exports, by content.
 pub(super) fn foreign_json(path: &Path) -> Option<PoseFile> {
     let value = value_of(path)?;
     let (first, path) = (value.get(0), path.to_owned());
@@ -346,6 +370,13 @@ pub(super) fn foreign_json(path: &Path) -> Option<PoseFile> {
     }
     if (first_has("transform") && first_has("file_path")) || value.get("camera_path").is_some() {
         return Some(PoseFile::Nerfstudio(path));
+    }
+    let has_list = |key: &str| value.get(key).is_some_and(serde_json::Value::is_array);
+    if has_list("views") && has_list("extrinsics") {
+        return Some(PoseFile::OpenMvg(path));
+    }
+    if has_list("views") && has_list("poses") {
+        return Some(PoseFile::Meshroom(path));
     }
     let record3d = value.get("K").is_some() && value.get("poses").is_some();
     record3d.then_some(PoseFile::Record3d(path))
@@ -367,6 +398,10 @@ fn any_json(folder: &Path) -> Option<PoseFile> {
 fn kind_of_json(path: &Path) -> Option<PoseFile> {
     match foreign_json(path) {
         Some(PoseFile::Nerfstudio(_)) => return None,
+        // A list of photographs.
+        Some(file @ (PoseFile::OpenMvg(_) | PoseFile::Meshroom(_))) if file.cameras() == 0 => {
+            return None;
+        }
         Some(file) => return Some(file),
         None => {}
     }

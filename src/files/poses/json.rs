@@ -49,6 +49,11 @@ pub(super) fn rows<'de, D: Deserializer<'de>>(
     Ok(rows.into_iter().map(numbers).collect())
 }
 
+/// A number, or the text of one, as boost's property trees have it; `None` for anything else.
+pub(super) fn number_of(value: &serde_json::Value) -> Option<f64> {
+    value.as_f64().or_else(|| value.as_str()?.trim().parse().ok())
+}
+
 /// Makes an error of a JSON error, with its line and column; serde's message has the
 /// expected and the found value.
 pub(super) fn error(path: &Path, expected: &str, error: &serde_json::Error) -> Error {

@@ -5,11 +5,11 @@
 //! farthest depth. Rows belong to the pictures in the order of Python's `sorted`, that is, by bytes. Where the
 //! pictures are in reduced copies alone (`images_4`), the intrinsics are scaled.
 //!
-//! Source: Fyusion/LLFF, `llff/poses/pose_utils.py` (`load_colmap_data`, `save_poses`, `load_data`). The crates
-//! that read .npy parse any Python literal; this one header needs few lines.
+//! Source: Fyusion/LLFF, `llff/poses/pose_utils.py` (`load_colmap_data`, `save_poses`, `load_data`).
 
 use super::assemble::{Draft, Lens, Pictures, assemble, list_images};
 use super::cameras_json::side;
+use super::npy;
 use super::reading::Reading;
 use super::scene::{Scene, SceneFormat};
 use crate::files::{Error, Result, read};
@@ -18,67 +18,25 @@ use std::path::{Path, PathBuf};
 use subsplat_kernels::camera::NearFar;
 
 const COLUMNS: usize = 17;
-const MAGIC: &[u8] = b"\x93NUMPY";
-/// Longest header, bytes. NumPy's own is about 118.
-const HEADER_MAX: usize = 4096;
 /// Folders of pictures below the scene's, in the order of preference.
 const FOLDERS: [&str; 5] = ["images", "images_2", "images_4", "images_8", ""];
 
 /// Reads the rows of an array N×17; `path` is for messages.
 ///
 /// # Errors
-/// No .npy, numbers that are not f32 or f64 (little-endian), another shape, order or length.
+/// Those of a NumPy array; another shape, no row.
 pub fn parse(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Vec<[f64; COLUMNS]>> {
     rows(path.as_ref(), bytes)
 }
 
 fn rows(path: &Path, bytes: &[u8]) -> Result<Vec<[f64; COLUMNS]>> {
-    let bad = |expected: &str, got: String| Error::format(path, expected, got);
-    let Some(rest) = bytes.strip_prefix(MAGIC) else {
-        return Err(bad("a NumPy array (.npy)", format!("{} other bytes", bytes.len())));
-    };
-    // Major and minor version, then the header's length: 2 bytes in version 1, else 4.
-    let (length, start) = match *rest {
-        [1, _, a, b, ..] => (usize::from(u16::from_le_bytes([a, b])), 4),
-        [2 | 3, _, a, b, c, d, ..] => (u32::from_le_bytes([a, b, c, d]) as usize, 6),
-        _ => return Err(bad("a NumPy array of version 1, 2 or 3", "another version".to_owned())),
-    };
-    let header = rest.get(start..).and_then(|rest| rest.get(..length.min(HEADER_MAX)));
-    let Some(header) = header.filter(|_| length <= HEADER_MAX) else {
-        let expected = format!("a header of at most {HEADER_MAX} bytes, all there");
-        return Err(bad(&expected, format!("{length} of {}", rest.len())));
-    };
-    let header = String::from_utf8_lossy(header);
-    let bytes = &rest[start + length..];
-    let Some(count) = shape(&header).filter(|_| header.contains("'fortran_order': False")) else {
-        let expected = format!("an array N x {COLUMNS} by rows");
-        return Err(bad(&expected, header.trim_end().to_owned()));
-    };
-    let (numbers, width): (Vec<f64>, usize) = if header.contains("'<f8'") {
-        let number = |b: &[u8]| b.try_into().map_or(f64::NAN, f64::from_le_bytes);
-        (bytes.chunks_exact(8).map(number).collect(), 8)
-    } else if header.contains("'<f4'") {
-        let number = |b: &[u8]| b.try_into().map_or(f64::NAN, |b| f64::from(f32::from_le_bytes(b)));
-        (bytes.chunks_exact(4).map(number).collect(), 4)
-    } else {
-        return Err(bad("numbers `<f8` or `<f4`", header.trim_end().to_owned()));
-    };
-    let found = numbers.chunks_exact(COLUMNS);
-    if count == 0 || count != found.len() || bytes.len() != width * COLUMNS * count {
-        let expected = format!("{count} rows of {COLUMNS} numbers, at least one row");
-        return Err(bad(&expected, format!("{} bytes of numbers", bytes.len())));
+    let array = npy::parse(path, bytes)?;
+    if array.columns != COLUMNS || array.rows == 0 {
+        let expected = format!("an array N x {COLUMNS} of at least one row");
+        return Err(Error::format(path, expected, array.shape()));
     }
-    Ok(found.filter_map(|row| row.try_into().ok()).collect())
-}
-
-/// Number of rows of the header's shape `(N, 17)`.
-fn shape(header: &str) -> Option<usize> {
-    let (_, rest) = header.split_once("'shape': (")?;
-    let (inside, _) = rest.split_once(')')?;
-    let sides: Vec<&str> = inside.split(',').map(str::trim).filter(|s| !s.is_empty()).collect();
-    let &[rows, columns] = sides.as_slice() else { return None };
-    (columns.parse() == Ok(COLUMNS)).then_some(())?;
-    rows.parse().ok()
+    let rows = array.numbers.chunks_exact(COLUMNS);
+    Ok(rows.filter_map(|row| row.try_into().ok()).collect())
 }
 
 /// Number of cameras; 0 where the file cannot be read.

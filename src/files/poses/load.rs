@@ -5,8 +5,9 @@ use super::find::{self, Found, PoseFile, find, not_read};
 use super::reading::{Reading, SceneOptions};
 use super::scene::Scene;
 use super::{
-    bundler, cameras_json, colmap, llff, matrices, metashape, nerfstudio, opensfm, polycam, re10k,
-    reality_capture, record3d, transforms, without_camera,
+    bundler, cameras_json, colmap, llff, matrices, matrix_files, meshroom, metashape, mvsnet,
+    nerfstudio, neus, openmvg, opensfm, polycam, re10k, reality_capture, record3d, scanner_app,
+    transforms, without_camera,
 };
 use crate::files::{Error, Result, lower_extension};
 use std::path::Path;
@@ -90,8 +91,9 @@ fn with_pictures_counted(mut scene: Scene, path: &Path, reading: &Reading<'_>) -
 }
 
 /// For messages: the pose files of a folder.
-const SCENES: &str = "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, poses.txt with K.txt, or \
-     the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML) or RealityCapture (CSV)";
+const SCENES: &str = "cameras.json, transforms.json, a COLMAP model (sparse/0), a RealEstate10K txt, poses.txt with \
+     K.txt, or the cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape (XML), RealityCapture (CSV), \
+     OpenMVG, Meshroom, 3D Scanner App, MVSNet, NeuS, ScanNet, 7-Scenes, NSVF or NeRF++";
 
 /// Reads the pose file or the folder of one that [`SceneOptions::model`] names.
 fn load_model(model: &Path, reading: &Reading<'_>) -> Result<Scene> {
@@ -122,6 +124,12 @@ fn load_found(file: &PoseFile, reading: &Reading<'_>) -> Result<Scene> {
         PoseFile::Metashape(file) => metashape::load(file, reading),
         PoseFile::RealityCapture(file) => reality_capture::load(file, reading),
         PoseFile::Nerfstudio(file) => nerfstudio::load(file, reading),
+        PoseFile::OpenMvg(file) => openmvg::load(file, reading),
+        PoseFile::Meshroom(file) => meshroom::load(file, reading),
+        PoseFile::ScannerApp(folder) => scanner_app::load(folder, reading),
+        PoseFile::MvsNet(folder) => mvsnet::load(folder, reading),
+        PoseFile::Neus(file) => neus::load(file, reading),
+        PoseFile::MatrixFiles(folder) => matrix_files::load(folder, reading),
     }
 }
 
@@ -135,16 +143,20 @@ fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
             None => load_json(path, reading),
         },
         (_, "npy") => llff::load(path, reading),
+        (_, "npz") => neus::load(path, reading),
+        (_, "sfm") => meshroom::load(path, reading),
         (_, "out") => bundler::load(path, reading),
         (_, "xml") => metashape::load(path, reading),
         (_, "csv") => reality_capture::load(path, reading),
         ("cameras.txt" | "images.txt" | "points3d.txt", _) => colmap::load_text(folder, reading),
         (_, "bin") => colmap::load(folder, reading),
         ("poses.txt" | "k.txt", _) => matrices::load_with(folder, reading),
+        (name, "txt") if name.ends_with(mvsnet::ENDING) => mvsnet::load(folder, reading),
+        (name, "txt") if name.ends_with(matrix_files::POSE) => matrix_files::load(folder, reading),
         (_, "txt") => re10k::load(path, reading),
         _ => Err(Error::format(
             path,
-            "a folder or a pose file (.json, .txt, .bin, .npy, .out, .xml, .csv)",
+            "a folder or a pose file (.json, .txt, .bin, .npy, .npz, .out, .xml, .csv, .sfm)",
             format!("a file with extension `{extension}`"),
         )),
     }

@@ -37,7 +37,7 @@ impl PoseConvention {
 }
 
 /// Parses the numbers of a text; an error is the first word that is not a number.
-fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
+pub(super) fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
     let text = text.split('#').next().unwrap_or("");
     text.split(|c: char| c.is_whitespace() || ",;[]()".contains(c))
         .filter(|w| !w.is_empty())
@@ -59,14 +59,18 @@ pub fn parse_matrix(text: &str) -> std::result::Result<DMat4, String> {
     Ok(DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose())
 }
 
-/// Parses fx, fy, cx, cy from 9 (3×3, row by row, no skew) or 4 numbers.
+/// Parses fx, fy, cx, cy from 9 (3×3, row by row, no skew), 16 (4×4) or 4 numbers.
 ///
 /// # Errors
 /// A description of the text found.
 pub fn parse_intrinsics(text: &str) -> std::result::Result<[f64; 4], String> {
     let lines: Vec<&str> = text.lines().map(|l| l.split('#').next().unwrap_or("")).collect();
-    let v = numbers(&lines.join(" "))?;
-    match *v.as_slice() {
+    intrinsics(&numbers(&lines.join(" "))?)
+}
+
+/// fx, fy, cx, cy of the numbers of [`parse_intrinsics`].
+pub(super) fn intrinsics(v: &[f64]) -> std::result::Result<[f64; 4], String> {
+    match *v {
         [fx, fy, cx, cy] => Ok([fx, fy, cx, cy]),
         [fx, skew, cx, below, fy, cy, z0, z1, one] => {
             let shape_ok = below == 0.0 && z0 == 0.0 && z1 == 0.0 && one == 1.0;
@@ -75,11 +79,16 @@ pub fn parse_intrinsics(text: &str) -> std::result::Result<[f64; 4], String> {
             }
             Ok([fx, fy, cx, cy])
         }
+        [a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0, 0.0, 0.0, 0.0, 1.0] => {
+            intrinsics(&[a, b, c, d, e, f, g, h, i])
+        }
+        _ if v.len() == 16 => Err(format!("a 4x4 matrix that is no intrinsic matrix: {v:?}")),
         _ => Err(format!("{} numbers", v.len())),
     }
 }
 
-fn text(path: &Path) -> Result<String> {
+/// The text of a file.
+pub(super) fn text(path: &Path) -> Result<String> {
     String::from_utf8(utf8(&read(path)?).into_owned()).map_err(|e| {
         let at = format!(" at byte {}", e.utf8_error().valid_up_to());
         Error::format(path, "UTF-8 text", "other bytes").at(at)

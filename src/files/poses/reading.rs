@@ -25,8 +25,8 @@ pub struct SceneOptions {
     /// Refuses an entry that is left out, a mask that is not used and a point without a position.
     /// By default the scene is read without them, and a warning names them.
     pub strict: bool,
-    /// Direction and axes of the matrices of `poses.txt`, `transforms.json` and Polycam, where a program wrote
-    /// them in another convention than the format's. Other formats ignore it.
+    /// Direction and axes of the matrices of `poses.txt`, `transforms.json`, Polycam, 3D Scanner App, MVSNet and of
+    /// matrix files, where a program wrote them in another convention than the format's. Other formats ignore it.
     pub convention: Option<PoseConvention>,
 }
 

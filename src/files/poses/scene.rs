@@ -60,6 +60,18 @@ pub enum SceneFormat {
     RealityCapture,
     /// A list of poses of `ns-export cameras`, or a path of nerfstudio's viewer.
     Nerfstudio,
+    /// OpenMVG's `sfm_data.json`.
+    OpenMvg,
+    /// Meshroom's scene, `cameras.sfm`.
+    Meshroom,
+    /// 3D Scanner App's export of all data.
+    ScannerApp,
+    /// MVSNet's folder `cams`.
+    MvsNet,
+    /// NeuS's `cameras_sphere.npz`.
+    Neus,
+    /// A matrix file of each picture: ScanNet, 7-Scenes, NSVF, NeRF++.
+    MatrixFiles,
     /// Two pictures with cameras from the command line.
     Pair,
     /// Photographs whose cameras were estimated from the photographs alone.
@@ -83,6 +95,12 @@ impl SceneFormat {
             Self::Metashape => "Metashape's XML",
             Self::RealityCapture => "RealityCapture's CSV",
             Self::Nerfstudio => "nerfstudio's list of cameras",
+            Self::OpenMvg => "OpenMVG",
+            Self::Meshroom => "Meshroom",
+            Self::ScannerApp => "3D Scanner App",
+            Self::MvsNet => "MVSNet's cameras",
+            Self::Neus => "NeuS's cameras (.npz)",
+            Self::MatrixFiles => "a matrix file of each picture",
             Self::Pair => "two pictures with given cameras",
             Self::Photographs => "photographs with estimated cameras",
         }

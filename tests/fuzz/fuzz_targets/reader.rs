@@ -1,5 +1,5 @@
 //! One target of `subsplat_fuzz::targets`, the one that the environment variable `SUBSPLAT_FUZZ_TARGET` names. A
-//! program for each would be linked 37 times.
+//! program for each would be linked 43 times.
 #![no_main]
 
 use std::sync::LazyLock;

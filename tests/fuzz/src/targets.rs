@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use subsplat::files::photos::image::{LoadOptions, Truncated, parse_depth_png, parse_picture};
 use subsplat::files::photos::{exif, photograph, video};
 use subsplat::files::poses::{
-    bundler, cameras_json, colmap, llff, matrices, metashape, protocol, re10k, reality_capture,
-    scene,
+    bundler, cameras_json, colmap, llff, matrices, metashape, mvsnet, neus, protocol, re10k,
+    reality_capture, scene,
 };
 use subsplat::files::splats::{glb, ksplat, ply, sog, splat, spz};
 use subsplat::files::weights::torch::TorchFile;
@@ -38,9 +38,14 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("llff", |b| drop(llff::parse("fuzz", b))),
     ("llff_scene", |b| scene("poses_bounds.npy", b)),
     ("matrices", matrices_of),
+    ("matrix_files", matrix_files_of),
+    ("meshroom", |b| scene("cameras.sfm", b)),
     ("metashape", |b| drop(metashape::parse("fuzz", b))),
     ("metashape_scene", |b| scene("cameras.xml", b)),
+    ("mvsnet", |b| drop(mvsnet::parse("fuzz", b))),
     ("nerfstudio", |b| scene("transforms_train.json", b)),
+    ("neus", |b| drop(neus::parse("fuzz", b))),
+    ("openmvg", |b| scene("sfm_data.json", b)),
     ("opensfm", |b| scene("reconstruction.json", b)),
     ("photograph", photograph_of),
     ("picture", |b| drop(parse_picture(b, "fuzz.png"))),
@@ -53,6 +58,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("round_trip_cameras", round_trips::cameras),
     ("round_trip_exact", round_trips::exact),
     ("round_trip_packed", round_trips::packed),
+    ("scanner_app", scanner_app_of),
     ("sog", |b| splats(sog::parse_sog(b, "fuzz.sog"))),
     ("splat", |b| splats(splat::parse_splat(b, "fuzz.splat"))),
     ("spz", |b| splats(spz::parse_spz(b, "fuzz.spz"))),
@@ -68,6 +74,11 @@ pub const TARGETS: &[(&str, Target)] = &[
 pub fn target(name: &str) -> Option<Target> {
     TARGETS.iter().find(|(own, _)| *own == name).map(|(_, target)| *target)
 }
+
+/// Header of a picture of 4×4 px, BMP. Only its size is read.
+const PICTURE: [u8; 54] =
+    *b"BM\x66\0\0\0\0\0\0\0\x36\0\0\0\x28\0\0\0\x04\0\0\0\x04\0\0\0\x01\0\x18\0\0\0\0\0\
+    \x30\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0";
 
 /// A folder of this call alone, removed when the value is dropped. `TMPDIR` chooses the place.
 pub struct Folder(PathBuf);
@@ -120,10 +131,8 @@ impl Drop for Folder {
 fn scene(name: &str, bytes: &[u8]) {
     let folder = Folder::new();
     let path = folder.write(name, bytes);
-    let found = [scene::load_cameras(folder.path()), scene::load_cameras(&path)];
-    for frame in found.into_iter().flatten().flat_map(|scene| scene.frames) {
-        assert!(frame.camera.world_from_camera().is_finite(), "{:?}", frame.camera);
-    }
+    finite(scene::load_cameras(folder.path()));
+    finite(scene::load_cameras(&path));
     if name == "cameras.json" {
         let _ = cameras_json::load_cameras_json(&path);
     }
@@ -141,6 +150,31 @@ fn matrices_of(bytes: &[u8]) {
         matrices::PoseConvention::CameraFromWorldOpenCv,
     ] {
         let _ = matrices::load(folder.path(), convention);
+    }
+}
+
+/// A pose and, after the first zero byte, intrinsics, of a picture.
+fn matrix_files_of(bytes: &[u8]) {
+    let end = bytes.iter().position(|b| *b == 0).unwrap_or(bytes.len());
+    let (pose, intrinsics) = bytes.split_at(end);
+    let folder = Folder::new();
+    folder.write("pose/0.txt", pose);
+    folder.write("intrinsics.txt", intrinsics.get(1..).unwrap_or_default());
+    folder.write("rgb/0.png", &PICTURE);
+    finite(scene::load_cameras(folder.path()));
+}
+
+fn scanner_app_of(bytes: &[u8]) {
+    let folder = Folder::new();
+    folder.write("frame_00000.json", bytes);
+    folder.write("frame_00000.png", &PICTURE);
+    finite(scene::load_cameras(folder.path()));
+}
+
+/// What is read of a scene is finite.
+fn finite(scene: subsplat::files::Result<scene::Scene>) {
+    for frame in scene.into_iter().flat_map(|scene| scene.frames) {
+        assert!(frame.camera.world_from_camera().is_finite(), "{:?}", frame.camera);
     }
 }
 

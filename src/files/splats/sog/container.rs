@@ -1,16 +1,14 @@
 //! The files of a SOG: entries of a zip, or files of a folder, and pictures of bytes.
 //!
-//! An entry is stored or deflated; its CRC-32 is compared. A picture's size is compared with the
-//! bytes of all files so far before it is decoded.
+//! [`archive::entry`] reads an entry. A picture's size is compared with the bytes of all files so far before it is
+//! decoded.
 
 use super::META;
-use crate::files::{Error, Result, read};
-use flate2::Crc;
-use flate2::read::DeflateDecoder;
+use crate::files::{Error, Result, archive, read};
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
-use std::io::{Cursor, Read};
+use std::io::Cursor;
 use std::path::{Component, Path};
-use zip::{CompressionMethod, ZipArchive};
+use zip::ZipArchive;
 
 /// Longest `meta.json`, bytes: three codebooks of 256 numbers are 20 KB.
 const META_MAX: u64 = 4 << 20;
@@ -125,32 +123,7 @@ impl<'a> Container<'a> {
         let Place::Zip { archive, prefix } = &mut self.place else {
             return Err(("an archive".to_owned(), "a folder".to_owned()));
         };
-        let whole = |e: &dyn std::fmt::Display| ("a whole entry".to_owned(), e.to_string());
-        let index = archive
-            .index_for_name(&format!("{prefix}{name}"))
-            .ok_or_else(|| ("an entry of the archive".to_owned(), "none".to_owned()))?;
-        let mut entry = archive.by_index_raw(index).map_err(|e| whole(&e))?;
-        let (size, crc, method) = (entry.size(), entry.crc32(), entry.compression());
-        if size > limit {
-            return Err((format!("at most {limit} bytes"), size.to_string()));
-        }
-        let mut content = Vec::new();
-        let mut source: Box<dyn Read> = match method {
-            CompressionMethod::Stored => Box::new(&mut entry),
-            CompressionMethod::DEFLATE => Box::new(DeflateDecoder::new(&mut entry)),
-            other => return Err(("a stored or deflated entry".to_owned(), other.to_string())),
-        };
-        Read::take(&mut source, size + 1).read_to_end(&mut content).map_err(|e| whole(&e))?;
-        if content.len() as u64 != size {
-            let got = format!("{} or more", content.len());
-            return Err((format!("{size} bytes, as the archive says"), got));
-        }
-        let mut sum = Crc::new();
-        sum.update(&content);
-        if sum.sum() != crc {
-            return Err((format!("checksum {crc:08x}"), format!("{:08x}", sum.sum())));
-        }
-        Ok(content)
+        archive::entry(archive, &format!("{prefix}{name}"), limit)
     }
 
     /// Counts `size` decoded bytes, and refuses what no picture of real numbers shrinks to.

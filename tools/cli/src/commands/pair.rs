@@ -21,8 +21,14 @@ use subsplat::{EstimateOptions, EstimatedScene, estimate_cameras_of_files};
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Formats whose matrices programs write in several conventions.
-const WITH_CONVENTION: [SceneFormat; 3] =
-    [SceneFormat::Matrices, SceneFormat::Transforms, SceneFormat::Polycam];
+const WITH_CONVENTION: [SceneFormat; 6] = [
+    SceneFormat::Matrices,
+    SceneFormat::Transforms,
+    SceneFormat::Polycam,
+    SceneFormat::ScannerApp,
+    SceneFormat::MvsNet,
+    SceneFormat::MatrixFiles,
+];
 
 /// A scene, and whether its cameras are an estimate of low confidence.
 pub struct Loaded {
@@ -79,8 +85,8 @@ pub fn load(
     let scene = load_scene_with(one, &options)?;
     ensure!(
         convention.is_none() || WITH_CONVENTION.contains(&scene.source),
-        "--pose-convention: expected two photographs, or a scene with poses.txt, transforms.json or \
-         Polycam's cameras, got {} ({})",
+        "--pose-convention: expected two photographs, or a scene with poses.txt, transforms.json, a \
+         matrix file of each picture, or cameras of Polycam, 3D Scanner App or MVSNet, got {} ({})",
         one.display(),
         scene.source.name()
     );
@@ -214,8 +220,8 @@ fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
     ensure!(
         found.photographs.len() >= 2,
         "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a RealEstate10K txt, poses.txt \
-         with K.txt, or cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape or RealityCapture) or a \
-         folder of at least 2 photographs, got {} photograph(s) and no cameras",
+         with K.txt, or cameras of OpenSfM, Polycam, Record3D, Bundler, LLFF, Metashape, RealityCapture, OpenMVG, \
+         Meshroom, 3D Scanner App, MVSNet, NeuS, ScanNet, 7-Scenes, NSVF or NeRF++) or a folder of at least 2 photographs, got {} photograph(s) and no cameras",
         folder.display(),
         found.photographs.len()
     );

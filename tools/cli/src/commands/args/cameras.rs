@@ -143,9 +143,10 @@ pub struct PairArgs {
     pub pose_b: Option<String>,
     /// Axes and direction of --pose-a and --pose-b, or of a scene's matrices.
     ///
-    /// A scene with poses.txt, transforms.json or Polycam's cameras: where a program wrote other axes than the
-    /// format's. Default: opengl-c2w for transforms.json and Polycam, else opencv-c2w; where the photographs contradict
-    /// it and one other fits them, that one, and a line says so.
+    /// A scene with poses.txt, transforms.json, a matrix file of each picture, or cameras of Polycam, 3D Scanner App or
+    /// MVSNet: where a program wrote other axes than the format's. Default: opengl-c2w for transforms.json, Polycam and 3D
+    /// Scanner App, opencv-w2c for MVSNet, else opencv-c2w; where the photographs contradict it and one other fits them,
+    /// that one, and a line says so.
     #[arg(long, value_enum, hide_short_help = true, help_heading = CAMERAS)]
     pub pose_convention: Option<PoseConventionArg>,
     /// Cameras and pictures of a scene.

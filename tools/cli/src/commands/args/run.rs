@@ -16,8 +16,9 @@ pub struct RunArgs {
     ///
     /// Of photographs alone the cameras are found first. Of a video (ffmpeg reads it) sharp frames are taken where the
     /// camera has moved on, and kept in the folder `frames` of the results. A scene with cameras is a folder or a pose
-    /// file: cameras.json, transforms.json, COLMAP's model, RealEstate10K's txt, or poses.txt with
-    /// K.txt.
+    /// file: cameras.json, transforms.json, COLMAP's model, RealEstate10K's txt, poses.txt with K.txt, or cameras of
+    /// another program or data set (OpenSfM, OpenMVG, Meshroom, Metashape, RealityCapture, Polycam, Record3D, 3D Scanner
+    /// App, Bundler, LLFF, MVSNet, NeuS, ScanNet, 7-Scenes, NSVF, NeRF++).
     #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR | VIDEO | SCENE")]
     pub input: Vec<PathBuf>,
     /// Folder for the results.
