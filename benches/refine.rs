@@ -1,7 +1,8 @@
 //! A refinement step ([`subsplat::finish::refine()`]) on one photograph beside the forward and backward pass
 //! of the rasterizer alone, on the rasterizer's scenes (`common/scene.rs`). A step adds the loss
 //! with its gradient and Adam's step of all Gaussians. The photograph is the scene's own picture
-//! with other colours. `-- curve FOLDER…` prints the score of new views over the seconds of a refinement
+//! with other colours. Where there is a GPU, `refinement step on GPU` is a step in its memory, and the row before it the
+//! passes of its rasterizer, with the picture and the gradients in host memory. `-- curve FOLDER…` prints the score of new views over the seconds of a refinement
 //! instead (`refine/curve.rs`).
 
 mod common;
@@ -15,6 +16,8 @@ use subsplat::finish::{PhaseRun, RefineOptions, TargetView};
 use subsplat::scene::pictures::Rgb;
 use subsplat::scene::render::{Renderer, render, slices};
 use subsplat_kernels::cpu::Rasterizer;
+use subsplat_kernels::gpu::wgpu::PollType;
+use subsplat_kernels::gpu::{DeviceChoice, Gpu, Rasterizer as GpuRasterizer};
 use subsplat_kernels::layout::{Gradients, RasterOptions};
 
 /// Scenes of the report: 131,072 Gaussians at 256², and 524,288 at 512².
@@ -76,6 +79,26 @@ fn main() -> Result<()> {
             let mut renderer = Renderer::default();
             contenders.push(Contender::new("refinement step", threads, move || {
                 phase.step(&mut renderer);
+                Ok(())
+            }));
+        }
+        if let Ok(Some(gpu)) = Gpu::open(&DeviceChoice::Gpu) {
+            let mut rasterizer = GpuRasterizer::new(gpu.clone());
+            let (splats, camera, raster, upstream) = (&splats, &camera, &raster, &upstream);
+            contenders.push(Contender::new(
+                "GPU rasterizer, both passes",
+                Threads::All,
+                move || {
+                    rasterizer.backward(&slices(splats), camera, raster, upstream)?;
+                    Ok(())
+                },
+            ));
+            let mut phase = PhaseRun::new(splats, &views, raster, &slow)?;
+            let mut renderer = Renderer::with_gpu(gpu.clone());
+            contenders.push(Contender::new("refinement step on GPU", Threads::All, move || {
+                phase.step(&mut renderer);
+                // A step returns before the device has completed it.
+                gpu.device().poll(PollType::wait_indefinitely())?;
                 Ok(())
             }));
         }

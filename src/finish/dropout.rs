@@ -37,6 +37,14 @@ impl Dropout {
         Self { step: step as u64, limit, denser: 1.0 / (1.0 - share) }
     }
 
+    /// The same Gaussians on a GPU.
+    #[cfg(feature = "gpu")]
+    pub fn for_device(&self) -> subsplat_kernels::gpu::LeftOut {
+        // The hash reads the lower half alone.
+        let step = self.step as u32;
+        subsplat_kernels::gpu::LeftOut { step, limit: self.limit, denser: self.denser }
+    }
+
     /// Returns whether the step leaves out Gaussian `i`.
     fn leaves_out(&self, i: usize) -> bool {
         let key = ((self.step << 32) ^ i as u64).wrapping_add(1);

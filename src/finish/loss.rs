@@ -55,6 +55,15 @@ const CHUNK: usize = 4096;
 /// Rows of a parallel task of [`dssim`].
 const BAND: usize = 64;
 
+/// Returns the window and the constants of SSIM.
+pub fn ssim_window() -> Window<SSIM_WINDOW> {
+    Window {
+        taps: window().map(|t| t as f32),
+        c: [SSIM_C1 as f32, SSIM_C2 as f32],
+        covariance: SSIM_COVARIANCE as f32,
+    }
+}
+
 /// Returns the structural dissimilarity (1 − SSIM)/2 of planes `[C, height, width]` in [0, 1], with
 /// its gradient by `x`.
 ///
@@ -67,11 +76,7 @@ pub fn dssim(x: &[f32], target: &[f32], width: usize, height: usize) -> Scored {
     let pixels = width * height;
     let channels = (x.len() / pixels).max(1);
     let windows = (width - SSIM_WINDOW + 1) * (height - SSIM_WINDOW + 1) * channels;
-    let shape = Window {
-        taps: window().map(|t| t as f32),
-        c: [SSIM_C1 as f32, SSIM_C2 as f32],
-        covariance: SSIM_COVARIANCE as f32,
-    };
+    let shape = ssim_window();
     let factor = (-0.5 / windows as f64) as f32;
     let mut gradient = vec![0.0; x.len()];
     let planes =

@@ -9,12 +9,16 @@
 //! 2. [`refine()`]: means, shapes, opacities and colours, on one photograph after the other, some dozens of
 //!    steps. Parents that the photographs hardly show are removed first.
 //!
+//! Where the renderer has a GPU, the steps are taken in its memory (`on_device`).
+//!
 //! [`reduce()`] merges Gaussians of a finished scene until their number is as wanted.
 
 mod dropout;
 mod fit;
 pub mod loss;
 pub mod merge;
+#[cfg_attr(not(feature = "gpu"), path = "on_device_absent.rs")]
+mod on_device;
 mod optimiser;
 mod parameters;
 mod phase;

@@ -5,9 +5,9 @@
 //! The same input gives the same bytes on any number of threads.
 
 use super::parameters::{
-    BLOCK, Before, Buffer, COLOUR, ELEMENTS_MAX, GAIN_STRIDE, OPACITY, Part, PartMut,
+    BLOCK, Before, Buffer, COLOUR, ELEMENTS_MAX, Form, GAIN_STRIDE, Move, OPACITY, Part, PartMut,
 };
-use super::phase::{Move, Phase, Photographs, Start};
+use super::phase::{Phase, Photographs, Start};
 use crate::scene::splats::Splats;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -24,6 +24,11 @@ const BETAS: [f32; 2] = [0.9, 0.99];
 const EPSILON: f32 = 1e-15;
 /// Fewest blocks of a parallel task.
 const TASK: usize = 4096 / BLOCK;
+
+/// Bias corrections of Adam's moments after a number of steps.
+pub(super) fn corrections(steps: i32) -> [f32; 2] {
+    BETAS.map(|b| 1.0 - b.powi(steps))
+}
 
 /// Gradients of the loss of one photograph.
 pub(super) struct PhotographGradients<'a> {
@@ -99,6 +104,13 @@ pub(super) struct Numbers {
     gain: Vec<f32>,
     /// `[N, 3·D]`, or empty where the SH coefficients stayed.
     sh: Vec<f32>,
+}
+
+/// Rows, gains and SH coefficients.
+impl From<[Vec<f32>; 3]> for Numbers {
+    fn from([rows, gain, sh]: [Vec<f32>; 3]) -> Self {
+        Self { rows, gain, sh }
+    }
 }
 
 impl Numbers {
@@ -186,13 +198,13 @@ impl<'a> Optimiser<'a> {
         states = vec![0.0; self.rows.len().div_ceil(BLOCK * SPLAT_STRIDE) * size];
         let mut at = 0;
         for m in &self.moves {
-            if m.parameter == OPACITY {
+            if m.parameter.form == Form::Logit {
+                let first = m.parameter.first;
                 let blocks = states.par_chunks_exact_mut(size);
                 blocks.zip(self.rows.par_chunks(BLOCK * SPLAT_STRIDE)).for_each(|(state, rows)| {
                     let logits = state[at * BLOCK..].iter_mut();
                     for (to, row) in logits.zip(rows.chunks_exact(SPLAT_STRIDE)) {
-                        let alpha = row[OPACITY_OFFSET];
-                        *to = (alpha / (1.0 - alpha)).ln();
+                        *to = m.parameter.form.first_value(row[first]);
                     }
                 });
             }
@@ -234,6 +246,27 @@ impl<'a> Optimiser<'a> {
         Numbers { rows, gain, sh }
     }
 
+    /// Takes the numbers that a device gave the Gaussians.
+    pub fn set_numbers(&mut self, Numbers { rows, gain, sh }: Numbers) {
+        (self.rows, self.gain, self.sh) = (rows, gain, sh);
+    }
+
+    /// The Gaussians before the first step, and how they move, for a GPU.
+    #[cfg(feature = "gpu")]
+    pub fn for_device(&self) -> subsplat_kernels::gpu::OptimisedSplats<'_> {
+        subsplat_kernels::gpu::OptimisedSplats {
+            splats: self.slices(),
+            origin_rows: &self.before.rows,
+            pixels: &self.pixels,
+            spared: &self.spared,
+            scale: self.scale,
+            moves: &self.moves,
+            all_move: self.photographs == Photographs::All,
+            betas: BETAS,
+            epsilon: EPSILON,
+        }
+    }
+
     /// SH coefficients of a Gaussian, where each has a set.
     fn sh_stride(&self) -> usize {
         3 * sh_coefficients(self.before.sh_degree)
@@ -263,7 +296,7 @@ impl<'a> Optimiser<'a> {
         let adam = SelectiveAdam {
             betas: BETAS,
             rate: factor,
-            corrections: BETAS.map(|b| 1.0 - b.powi(self.steps)),
+            corrections: corrections(self.steps),
             epsilon: EPSILON,
         };
         let size = self.block_size();

@@ -11,7 +11,9 @@
 //! A new phase is another value of [`Phase`]. A new course of the rates is a variant of [`Schedule`].
 
 use super::fit::FitOptions;
-use super::parameters::{Buffer, COLOUR, MEAN, OPACITY, Parameter, ROTATION, SCALES, SH_1, SIZE};
+use super::parameters::{
+    Buffer, COLOUR, MEAN, Move, OPACITY, Parameter, ROTATION, SCALES, SH_1, SIZE,
+};
 use super::refine::RefineOptions;
 use crate::scene::splats::Splats;
 use std::time::Duration;
@@ -41,29 +43,6 @@ const PREDICTED: Start = Start { scale: 1.0, density: 1.0 };
 /// Children of the trained heads are twice as wide and less than half as dense as children that tile
 /// their pixel.
 const SHARPER: Start = Start { scale: 0.7, density: 2.0 };
-
-/// A parameter that moves.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Move {
-    /// The parameter.
-    pub parameter: Parameter,
-    /// Step of its elements, in their own unit.
-    pub rate: f32,
-    /// Least and largest value of its elements.
-    pub limits: Option<[f32; 2]>,
-}
-
-impl Move {
-    /// Without limits.
-    fn free(parameter: Parameter, rate: f32) -> Self {
-        Self { parameter, rate, limits: None }
-    }
-
-    /// With the limits `least` and `largest`.
-    fn within(parameter: Parameter, rate: f32, limits: [f32; 2]) -> Self {
-        Self { parameter, rate, limits: Some(limits) }
-    }
-}
 
 /// Factors on σ and on the density −ln(1 − α), with which a phase can start.
 #[derive(Clone, Copy, Debug, PartialEq)]

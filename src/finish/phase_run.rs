@@ -3,6 +3,7 @@
 
 use super::FinishError;
 use super::dropout::{self, Dropout};
+use super::on_device::OnDevice;
 use super::optimiser::{Across, Optimiser, PhotographGradients};
 use super::parameters::MEAN;
 use super::phase::{Measure, Phase, Photographs};
@@ -29,7 +30,10 @@ pub struct PhaseRun<'a> {
     groups: Groups,
     /// Begin of the first step, where time limits the steps.
     begun: Option<Instant>,
+    /// The Gaussians, and their state unless `on_device` has it.
     optimiser: Optimiser<'a>,
+    /// The state of the Gaussians in the memory of a GPU.
+    on_device: Option<OnDevice>,
     gradients: Gradients,
     /// Gradients by the Gaussians of a photograph that the step does not draw, drawn alone.
     across: Gradients,
@@ -38,6 +42,8 @@ pub struct PhaseRun<'a> {
     step: usize,
     /// Set by [`PhaseRun::end`].
     end: Cell<Option<End>>,
+    /// A device lost steps of this phase.
+    lost_device: bool,
 }
 
 /// Least and largest number of steps after [`PhaseRun::end`]: one round of the photographs, within these.
@@ -117,12 +123,14 @@ impl<'a> PhaseRun<'a> {
             groups,
             begun: None,
             optimiser: Optimiser::new(splats, &phase, photographs, pixels, spared),
+            on_device: None,
             phase,
             across: Gradients { sh_limit: Some(0), ..Gradients::default() },
             gradients,
             drawn: Vec::new(),
             step: 0,
             end: Cell::new(None),
+            lost_device: false,
         })
     }
 
@@ -133,7 +141,11 @@ impl<'a> PhaseRun<'a> {
 
     /// The Gaussians after the steps so far.
     pub fn splats(&self) -> Splats {
-        self.optimiser.splats()
+        let mut splats = self.optimiser.splats();
+        if let Some(numbers) = self.on_device.as_ref().and_then(OnDevice::numbers) {
+            numbers.write_to(&mut splats);
+        }
+        splats
     }
 
     /// Ends the steps of a whole phase ([`refine`](super::refine())) that shows itself to its caller, after one more
@@ -146,6 +158,9 @@ impl<'a> PhaseRun<'a> {
     }
 
     /// Takes one step. Does nothing without photographs or Gaussians.
+    ///
+    /// The first step decides where all are taken: in the memory of the renderer's GPU, or in that of the CPU with
+    /// the renderer. A device that fails loses the steps; the phase then begins again with this one.
     pub fn step(&mut self, renderer: &mut Renderer) {
         let views = self.targets.len();
         if views == 0 || self.optimiser.rows().is_empty() {
@@ -154,6 +169,9 @@ impl<'a> PhaseRun<'a> {
         if self.begun.is_none() && self.phase.time.is_some() {
             self.begun = Some(Instant::now());
         }
+        if self.step == 0 && !self.lost_device {
+            self.on_device = self.copied(renderer);
+        }
         let photographs = match self.phase.photographs {
             Photographs::All => 0..views,
             Photographs::InTurn => {
@@ -161,27 +179,71 @@ impl<'a> PhaseRun<'a> {
                 view..view + 1
             }
         };
+        let share = dropout::share(self.phase.dropout, views);
+        let dropout = (share > 0.0).then(|| Dropout::new(share, self.step));
+        self.step += 1;
+        let factor = self.phase.schedule.factor(self.course());
+        if let Some(on_device) = &mut self.on_device {
+            if !on_device.step(photographs, factor, dropout.as_ref()) {
+                self.begin_again();
+                self.step(renderer);
+            }
+            return;
+        }
         let last = photographs.end - 1;
         for view in photographs.start..last {
-            let other = self.add_gradients(view, renderer);
+            let other = self.add_gradients(view, dropout.as_ref(), renderer);
             let gradients = gradients_of(&self.gradients, &self.across, other, &self.phase);
             self.optimiser.add(&gradients);
         }
-        let other = self.add_gradients(last, renderer);
-        self.step += 1;
-        let factor = self.phase.schedule.factor(self.course());
+        let other = self.add_gradients(last, dropout.as_ref(), renderer);
         let gradients = gradients_of(&self.gradients, &self.across, other, &self.phase);
         self.optimiser.step(&gradients, factor);
     }
 
+    /// Copies the Gaussians to the renderer's GPU.
+    fn copied(&self, renderer: &Renderer) -> Option<OnDevice> {
+        let (optimiser, targets, raster) = (&self.optimiser, &self.targets, &self.raster);
+        let across = |view| self.other(view);
+        OnDevice::new(renderer, optimiser, targets, across, raster, self.phase.loss)
+    }
+
+    /// Goes back to the Gaussians before the first step, after the device has lost the others.
+    fn begin_again(&mut self) {
+        (self.on_device, self.lost_device, self.step) = (None, true, 0);
+        self.end.set(self.end.get().map(|end| End { begin: 0, ..end }));
+    }
+
+    /// Reads the Gaussians after the last step. Returns whether the device had them; else the phase begins again.
+    fn collect(&mut self) -> bool {
+        let Some(on_device) = &self.on_device else { return true };
+        let Some(numbers) = on_device.numbers() else {
+            self.begin_again();
+            return false;
+        };
+        self.optimiser.set_numbers(numbers);
+        true
+    }
+
+    /// The Gaussians of the other one of two photographs, where photograph `view` draws these alone as well.
+    fn other(&self, view: usize) -> Range<usize> {
+        if !(self.phase.loss.across > 0.0) || self.targets.len() != 2 {
+            return 0..0;
+        }
+        self.group(1 - view).unwrap_or(0..0)
+    }
+
     /// Computes the gradients of the loss of photograph `view`. Returns the Gaussians of the other one of
     /// two photographs, where these are drawn alone as well.
-    fn add_gradients(&mut self, view: usize, renderer: &mut Renderer) -> Range<usize> {
+    fn add_gradients(
+        &mut self,
+        view: usize,
+        dropout: Option<&Dropout>,
+        renderer: &mut Renderer,
+    ) -> Range<usize> {
         let target = &self.targets[view];
         let rows = self.optimiser.rows();
-        let share = dropout::share(self.phase.dropout, self.targets.len());
-        let dropout = (share > 0.0).then(|| Dropout::new(share, self.step));
-        if let Some(dropout) = &dropout {
+        if let Some(dropout) = dropout {
             dropout.draw(rows, &mut self.drawn);
         }
         let rows = if dropout.is_some() { &self.drawn } else { rows };
@@ -190,13 +252,10 @@ impl<'a> PhaseRun<'a> {
         renderer.gradients_of(&slices, camera, raster, &mut self.gradients, &mut |planes| {
             by_planes(target.loss(planes), planes)
         });
-        if let Some(dropout) = &dropout {
+        if let Some(dropout) = dropout {
             dropout.chain(self.optimiser.rows(), &self.drawn, &mut self.gradients.rows);
         }
-        if !(self.phase.loss.across > 0.0) || self.targets.len() != 2 {
-            return 0..0;
-        }
-        let other = self.group(1 - view).unwrap_or(0..0);
+        let other = self.other(view);
         if !other.is_empty() {
             let slices = part_of(self.optimiser.slices(), &other);
             renderer.gradients_of(&slices, camera, raster, &mut self.across, &mut |planes| {
@@ -234,6 +293,36 @@ impl<'a> PhaseRun<'a> {
         ended || self.step >= self.phase.steps || self.progress() >= 1.0
     }
 
+    /// Takes the steps of the whole phase.
+    ///
+    /// # Errors
+    /// [`FinishError::Cancelled`].
+    fn take_steps(
+        &mut self,
+        renderer: &mut Renderer,
+        progress: &mut dyn FnMut(&PhaseRun<'_>) -> ControlFlow<()>,
+    ) -> Result<(), FinishError> {
+        let mut last = None;
+        while !self.is_done() {
+            self.step(renderer);
+            if progress(self).is_break() {
+                return Err(FinishError::Cancelled);
+            }
+            let Some(patience) = self.phase.patience else { continue };
+            let between = patience.rounds * self.targets.len();
+            // High rates at the beginning can raise the error for a while.
+            let settled = self.progress() >= 0.5 && self.steps() + between < self.phase.steps;
+            if settled && self.steps().is_multiple_of(between) {
+                let error = self.error(renderer);
+                if last.is_some_and(|last| !(error < last * (1.0 - patience.least_gain))) {
+                    break;
+                }
+                last = Some(error);
+            }
+        }
+        Ok(())
+    }
+
     /// The measure of the phase ([`RefineReport`](super::RefineReport)): mean over the photographs.
     pub fn error(&self, renderer: &mut Renderer) -> f64 {
         let [error, _] = self.measure(renderer);
@@ -243,25 +332,43 @@ impl<'a> PhaseRun<'a> {
     /// [`PhaseRun::error`], and the mean share of the photographs on which it was measured.
     fn measure(&self, renderer: &mut Renderer) -> [f64; 2] {
         let mut sum = [0.0; 2];
-        for (view, target) in self.targets.iter().enumerate() {
-            let mut draw = |rows: &[f32]| {
-                let slices = self.optimiser.slices_of(rows);
-                renderer.render_planes(&slices, target.camera, &self.raster)
+        for view in 0..self.targets.len() {
+            let own = match self.phase.measure {
+                Measure::Difference if self.targets.len() == 2 => self.group(view),
+                Measure::Difference | Measure::Loss => None,
             };
-            let rows = self.optimiser.rows();
-            let [error, covered] = match (self.phase.measure, self.group(view)) {
-                (Measure::Loss, _) => [target.loss(&draw(rows)).value, 1.0],
-                (Measure::Difference, Some(group)) if self.targets.len() == 2 => {
-                    let mut rows = rows.to_vec();
-                    let own = &mut rows[group.start * SPLAT_STRIDE..group.end * SPLAT_STRIDE];
-                    own.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
-                    target.error_where_covered(&draw(&rows))
-                }
-                (Measure::Difference, _) => [target.error(&draw(rows)), 1.0],
-            };
+            let on_device = self.on_device.as_ref();
+            let measured = on_device.and_then(|d| d.measure(view, self.phase.measure, own.clone()));
+            let [error, covered] = measured.unwrap_or_else(|| self.measure_of(view, own, renderer));
             sum = [sum[0] + error, sum[1] + covered];
         }
         sum.map(|s| s / self.targets.len().max(1) as f64)
+    }
+
+    /// The measure of photograph `view` and the share of it that counts; without the Gaussians `own`, where these
+    /// are given.
+    fn measure_of(
+        &self,
+        view: usize,
+        own: Option<Range<usize>>,
+        renderer: &mut Renderer,
+    ) -> [f64; 2] {
+        let target = &self.targets[view];
+        let mut draw = |rows: &[f32]| {
+            let slices = self.optimiser.slices_of(rows);
+            renderer.render_planes(&slices, target.camera, &self.raster)
+        };
+        let rows = self.optimiser.rows();
+        match (self.phase.measure, own) {
+            (Measure::Loss, _) => [target.loss(&draw(rows)).value, 1.0],
+            (Measure::Difference, Some(own)) => {
+                let mut rows = rows.to_vec();
+                let own = &mut rows[own.start * SPLAT_STRIDE..own.end * SPLAT_STRIDE];
+                own.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
+                target.error_where_covered(&draw(&rows))
+            }
+            (Measure::Difference, None) => [target.error(&draw(rows)), 1.0],
+        }
     }
 
     /// Takes the start of the phase with the smallest measure. The first one has the measure `first`.
@@ -328,22 +435,10 @@ pub(super) fn run(
         return Ok(Outcome::unchanged(0, before));
     }
     phase_run.choose_start(before, renderer);
-    let mut last = None;
-    while !phase_run.is_done() {
-        phase_run.step(renderer);
-        if progress(&phase_run).is_break() {
-            return Err(FinishError::Cancelled);
-        }
-        let Some(patience) = phase.patience else { continue };
-        let between = patience.rounds * views.len();
-        // High rates at the beginning can raise the error for a while.
-        let settled = phase_run.progress() >= 0.5 && phase_run.steps() + between < phase.steps;
-        if settled && phase_run.steps().is_multiple_of(between) {
-            let error = phase_run.error(renderer);
-            if last.is_some_and(|last| !(error < last * (1.0 - patience.least_gain))) {
-                break;
-            }
-            last = Some(error);
+    loop {
+        phase_run.take_steps(renderer, progress)?;
+        if phase_run.collect() {
+            break;
         }
     }
     let steps = phase_run.steps();

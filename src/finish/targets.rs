@@ -9,6 +9,8 @@ use crate::scene::splats::Splats;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use subsplat_kernels::camera::Camera;
+#[cfg(feature = "gpu")]
+use subsplat_kernels::gpu::{Gpu, GpuError, TargetPicture};
 use subsplat_kernels::layout::{MEAN_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 
 /// A picture that the Gaussians are to give.
@@ -50,11 +52,14 @@ pub(super) fn whole<'a>(views: &[TargetView<'a>]) -> Vec<MaskedView<'a>> {
 
 /// Coverage up to which a picture of some of the Gaussians does not count; above it, the weight of a
 /// pixel grows linearly to 1.
-const COVERAGE_MIN: f32 = 0.7;
+pub(super) const COVERAGE_MIN: f32 = 0.7;
 
 /// A view with its truth as planes.
 pub(super) struct Target<'a> {
     pub camera: &'a Camera,
+    /// The picture.
+    #[cfg(feature = "gpu")]
+    image: &'a Rgb,
     /// `[3, H, W]`.
     pub truth: Vec<f32>,
     /// Pixels that count.
@@ -86,8 +91,24 @@ impl<'a> Target<'a> {
         weights: LossWeights,
     ) -> Result<Self, FinishError> {
         Self::check(index, view)?;
-        let truth = view.image.to_planes();
-        Ok(Self { camera: view.camera, truth, mask: view.mask, weights })
+        Ok(Self {
+            camera: view.camera,
+            #[cfg(feature = "gpu")]
+            image: view.image,
+            truth: view.image.to_planes(),
+            mask: view.mask,
+            weights,
+        })
+    }
+
+    /// Copies the picture and its mask to a GPU.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    #[cfg(feature = "gpu")]
+    pub fn picture(&self, gpu: &Gpu) -> Result<TargetPicture, GpuError> {
+        let Rgb { width, height, data } = self.image;
+        gpu.target_picture(data, self.mask.map(Mask::kept), [*width, *height])
     }
 
     /// The loss of rendered planes `[5, H, W]`, with its gradient by R, G and B.

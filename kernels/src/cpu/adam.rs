@@ -2,8 +2,8 @@
 //! with decoupled decay, clipping and the moving average of the weights (AdamW, Loshchilov and Hutter
 //! 2019); and for Gaussians of which a photograph shows a part.
 //!
-//! WGSL: wgsl/network/adam.wgsl (training). Oracles and tests: tools/lab/tests/scores/train_parts.rs,
-//! tests/gpu/optimizer.rs; finish/optimiser.rs.
+//! WGSL: wgsl/network/adam.wgsl (training), wgsl/finish/optimise.wgsl (Gaussians). Oracles and tests:
+//! tools/lab/tests/scores/train_parts.rs, tests/gpu/optimizer.rs; finish/optimiser.rs.
 
 use super::simd::vectorize;
 use rayon::prelude::*;

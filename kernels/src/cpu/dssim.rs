@@ -3,7 +3,8 @@
 //!
 //! Windowed means are two passes of N taps, each with a block of results in registers.
 //! The transpose of a windowed mean is a windowed mean with reversed taps of the map with
-//! N − 1 zeros around it. A plane is computed in bands of rows, which threads share.
+//! N − 1 zeros around it. A plane is computed in bands of rows, which threads share. WGSL:
+//! wgsl/finish/dssim_windows.wgsl, wgsl/finish/loss_gradient.wgsl.
 
 use super::simd::vectorize;
 use super::sums::sum_of;

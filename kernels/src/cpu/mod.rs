@@ -20,6 +20,7 @@ pub mod join;
 pub mod matching;
 pub mod moves;
 pub mod norm;
+pub mod parameters;
 pub mod plane_sweep;
 pub mod raster;
 pub mod redistribute;

@@ -3,6 +3,8 @@
 //! Constants that CPU and GPU share are in [`crate::layout`], those of the GPU alone beside the code
 //! that they concern. A constant of one WGSL file alone is in that file.
 
+use crate::gpu::finish::loss::LOSS_TAPS;
+use crate::gpu::finish::optimiser::{PARAMETERS_MAX, RANGE_INSIDE, RANGE_OUTSIDE};
 use crate::gpu::network::NONE;
 use crate::gpu::network::attention_gather::{GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX};
 use crate::gpu::network::plane_sweep::SWEEP_PAIR_STRIDE;
@@ -10,6 +12,7 @@ use crate::gpu::raster::constants as raster;
 use crate::gpu::spgr::SPGR_CAMERA_STRIDE;
 use crate::layout as abi;
 use crate::layout::OpacityRule;
+use crate::layout::parameters::{Buffer, ELEMENTS_MAX, Form};
 
 /// Returns name and value of constants of a module.
 macro_rules! named {
@@ -29,8 +32,20 @@ const INTEGERS: [&[(&str, u32)]; 3] = [
         PLAN_REQUESTED, TILE_GPU,
     ),
     &[
+        ("BUFFER_GAIN", Buffer::Gain as u32),
+        ("BUFFER_SH", Buffer::Sh as u32),
+        ("FORM_COMMON_FACTOR", Form::CommonFactor as u32),
+        ("FORM_DIRECTION", Form::Direction as u32),
+        ("FORM_FACTOR", Form::Factor as u32),
+        ("FORM_LOGIT", Form::Logit as u32),
+        ("FORM_PIXEL_OFFSET", Form::PixelOffset as u32),
+        ("ELEMENTS_MAX", ELEMENTS_MAX as u32),
+        ("PARAMETERS_MAX", PARAMETERS_MAX as u32),
+        ("RANGE_INSIDE", RANGE_INSIDE),
+        ("RANGE_OUTSIDE", RANGE_OUTSIDE),
         ("GATHER_SAMPLES_MAX", GATHER_SAMPLES_MAX as u32),
         ("GATHER_WEIGHTS_MAX", GATHER_WEIGHTS_MAX as u32),
+        ("LOSS_TAPS", LOSS_TAPS as u32),
         ("NONE", NONE),
         ("SPGR_CAMERA_STRIDE", SPGR_CAMERA_STRIDE as u32),
         ("SWEEP_PAIR_STRIDE", SWEEP_PAIR_STRIDE as u32),

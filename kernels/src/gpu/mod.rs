@@ -14,6 +14,7 @@
 //! | folder | content |
 //! |---|---|
 //! | `raster` | rasterizer, its gradients, drawing to a texture |
+//! | `finish` | the optimisation of a scene on photographs |
 //! | `spgr` | children of parents, opacity redistribution, their gradients |
 //! | `network` | attention gather, plane sweep, their gradients |
 //! | `array` | arrays in device memory and the network's other operations |
@@ -73,6 +74,7 @@ mod commands;
 mod constants;
 mod device;
 mod error;
+mod finish;
 mod kernel;
 mod network;
 mod pipelines;
@@ -92,6 +94,11 @@ pub use array::{
 pub use buffers::{Buffer, ReadBacks};
 pub use device::{Gpu, features_of, limits_of};
 pub use error::GpuError;
+pub use finish::loss::{LOSS_TAPS, LossRules, PictureLoss, PixelWeights, TargetPicture};
+pub use finish::optimiser::{GivenGradients, LeftOut, OptimisedSplats, Rates};
+pub use finish::steps::{
+    MeasuredSplats, OptimiserRules, OptimiserStep, OptimiserTarget, SceneOptimiser,
+};
 pub use kernel::{Access, Kernel, Source};
 pub use network::attention_gather::AttentionGatherArgs;
 pub use network::attention_gather_bwd::AttentionGatherGradients;
@@ -127,6 +134,13 @@ pub const KERNELS: &[&Kernel] = &[
     &spgr::redistribute::REDISTRIBUTE,
     &spgr::redistribute::REDISTRIBUTE_BWD,
     &raster::show::SHOW,
+    &finish::loss::DSSIM_WINDOWS,
+    &finish::loss::LOSS_GRADIENT,
+    &finish::loss::PICTURE_ERROR,
+    &finish::optimiser::DRAWN_ROWS,
+    &finish::optimiser::WATCH_PAIRS,
+    &finish::optimiser::PARAMETER_GRADIENTS,
+    &finish::optimiser::OPTIMISE,
     &network::attention_gather::ATTENTION_GATHER,
     &network::plane_sweep::PLANE_SWEEP,
     &spgr::SPGR,

@@ -7,6 +7,7 @@
 
 mod frame;
 mod gather;
+pub mod parameters;
 mod positions;
 pub mod random;
 mod spgr;

@@ -88,9 +88,3 @@ fn pack(v: vec2<u32>) -> u32 {
 fn unpack(v: u32) -> vec2<u32> {
     return vec2<u32>(v & 0xffffu, v >> 16u);
 }
-
-// Returns whether v is neither infinite nor NaN. The test uses the bits, because compilers may
-// assume that neither occurs.
-fn finite(v: f32) -> bool {
-    return (bitcast<u32>(v) & 0x7f800000u) != 0x7f800000u;
-}

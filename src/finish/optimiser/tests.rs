@@ -1,6 +1,8 @@
 //! One Gaussian alone, by the formulas, beside the optimiser's blocks.
 
 use super::*;
+#[cfg(feature = "gpu")]
+use crate::finish::dropout::Dropout;
 use crate::finish::{FitOptions, RefineOptions};
 use subsplat_kernels::layout::{MEAN_OFFSET, QUAT_OFFSET, ShBasis};
 
@@ -258,16 +260,129 @@ fn a_phase_moves_each_number_once() {
     for (phase, numbers) in [(fit, 7), (refine, 23)] {
         let mut moved = Vec::new();
         for m in &phase.moves {
-            let count = match m.parameter.form {
-                crate::finish::parameters::Form::CommonFactor => 3,
-                _ => m.parameter.elements(),
-            };
             assert!(m.parameter.elements() <= ELEMENTS_MAX && m.rate > 0.0);
-            moved.extend((0..count).map(|e| (m.parameter.buffer as u8, m.parameter.first + e)));
+            moved.extend(
+                (0..m.parameter.numbers())
+                    .map(|e| (m.parameter.buffer as u8, m.parameter.first + e)),
+            );
         }
         let all = moved.len();
         moved.sort_unstable();
         moved.dedup();
         assert_eq!((moved.len(), all), (numbers, numbers));
     }
+}
+
+/// Tolerance of a number after some steps on a GPU, of its distance from 0 or 1, whichever is larger: a dozen
+/// roundings a step, and exponentials, roots and quotients that are exact to 3 units in the last place.
+#[cfg(feature = "gpu")]
+const ON_DEVICE: f32 = 2e-5;
+
+#[cfg(feature = "gpu")]
+#[track_caller]
+fn assert_near(name: &str, got: &[f32], expected: &[f32]) {
+    assert_eq!(got.len(), expected.len(), "{name}");
+    for (i, (got, expected)) in got.iter().zip(expected).enumerate() {
+        let off = (got - expected).abs() / expected.abs().max(1.0);
+        assert!(off < ON_DEVICE, "{name} {i}: {got} {expected}");
+    }
+}
+
+/// Gradients of `COUNT` Gaussians that are 0 but for those `of`.
+#[cfg(feature = "gpu")]
+fn spread(part: &Gradients, of: Range<usize>) -> Gradients {
+    let mut all = Gradients { rows: vec![0.0; COUNT * SPLAT_STRIDE], ..Gradients::default() };
+    all.rows[of.start * SPLAT_STRIDE..of.end * SPLAT_STRIDE].copy_from_slice(&part.rows);
+    all
+}
+
+#[cfg(feature = "gpu")]
+#[test]
+fn a_device_refines_as_the_cpu_does() {
+    use subsplat_kernels::gpu::{GivenGradients, Rates};
+    let Some(gpu) = subsplat_test_support::gpu::gpu() else { return };
+    let four = gaussians();
+    let sh: Vec<f32> = (0..12 * COUNT).map(|i| 0.01 * (i % 50) as f32).collect();
+    let splats = Splats::new(four.rows, sh, four.gain, 1, ShBasis::Standard).unwrap();
+    let pixels: Vec<f32> = (0..COUNT).map(|i| 0.01 + 1e-4 * i as f32).collect();
+    let spared: Vec<bool> = (0..COUNT).map(|i| i % 5 == 1).collect();
+    // Two photographs have a picture across, three move SH coefficients and leave Gaussians out.
+    for photographs in [2, 3] {
+        let phase = Phase::refine(&RefineOptions::default()).of(&splats, photographs);
+        let mut on_cpu = Optimiser::new(&splats, &phase, 1, pixels.clone(), spared.clone());
+        let steps = 1..=4;
+        let by_all: Vec<Gradients> = (steps.clone())
+            .map(|step| {
+                let mut by = gradients(COUNT, 10 + step);
+                let mut noise = noise(50 + step);
+                by.sh =
+                    (0..12 * COUNT).map(|i| if i / 12 % 7 == 3 { 0.0 } else { noise() }).collect();
+                by
+            })
+            .collect();
+        let by_other: Vec<Gradients> =
+            steps.clone().map(|step| gradients(OTHER.len(), 20 + step)).collect();
+        let spread: Vec<Gradients> = by_other.iter().map(|by| spread(by, OTHER)).collect();
+        let dropouts = steps.clone().map(|step| Dropout::new(0.3, step as usize));
+        let dropouts: Vec<Dropout> = dropouts.collect();
+        let factor = |step: u64| 1.0 - 0.1 * step as f32;
+        let given = steps.clone().map(|step| {
+            let i = step as usize - 1;
+            let (across, left_out) = match photographs {
+                2 => (Some((&spread[i], 0.7)), None),
+                _ => (None, Some(dropouts[i].for_device())),
+            };
+            let given = GivenGradients { all: &by_all[i], across, left_out };
+            let corrections = corrections(step as i32);
+            (vec![given], Rates { factor: factor(step), corrections })
+        });
+        let given: Vec<_> = given.collect();
+        let [rows, gain, sh] = gpu.optimise(&on_cpu.for_device(), &given).unwrap();
+        for step in steps {
+            let i = step as usize - 1;
+            let mut all = by_all[i].clone();
+            let across = match photographs {
+                2 => Some(Across { gradients: &by_other[i], gaussians: OTHER, weight: 0.7 }),
+                _ => {
+                    let mut drawn = Vec::new();
+                    dropouts[i].draw(on_cpu.rows(), &mut drawn);
+                    dropouts[i].chain(on_cpu.rows(), &drawn, &mut all.rows);
+                    None
+                }
+            };
+            on_cpu.step(&PhotographGradients { all: &all, across }, factor(step));
+        }
+        assert_near("rows", &rows, on_cpu.rows());
+        assert_near("gain", &gain, on_cpu.slices().gain);
+        assert_near("sh", &sh, &on_cpu.sh);
+        assert_eq!(sh.is_empty(), photographs == 2);
+        assert_ne!(on_cpu.rows(), splats.rows);
+    }
+}
+
+#[cfg(feature = "gpu")]
+#[test]
+fn a_device_fits_as_the_cpu_does() {
+    use subsplat_kernels::gpu::{GivenGradients, Rates};
+    let Some(gpu) = subsplat_test_support::gpu::gpu() else { return };
+    let splats = gaussians();
+    let phase = Phase::fit(&FitOptions::default(), true);
+    let mut on_cpu = Optimiser::new(&splats, &phase, 2, Vec::new(), Vec::new());
+    on_cpu.begin(Some(phase.starts[1]));
+    let by: Vec<[Gradients; 2]> =
+        (1..=4).map(|step| [30, 40].map(|seed| gradients(COUNT, seed + step))).collect();
+    let of = |all| GivenGradients { all, across: None, left_out: None };
+    let given = by.iter().zip(1..).map(|(by, step)| {
+        let corrections = corrections(step);
+        (by.iter().map(of).collect(), Rates { factor: 1.0, corrections })
+    });
+    let given: Vec<_> = given.collect();
+    let [rows, gain, sh] = gpu.optimise(&on_cpu.for_device(), &given).unwrap();
+    for [first, last] in &by {
+        on_cpu.add(&PhotographGradients { all: first, across: None });
+        on_cpu.step(&PhotographGradients { all: last, across: None }, 1.0);
+    }
+    assert_near("rows", &rows, on_cpu.rows());
+    assert_near("gain", &gain, on_cpu.slices().gain);
+    assert!(sh.is_empty());
 }

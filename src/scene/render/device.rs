@@ -71,6 +71,15 @@ impl Renderer {
         })
     }
 
+    /// Returns the GPU that renders now.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn gpu(&self) -> Option<&std::sync::Arc<gpu::Gpu>> {
+        match &self.rasterizer {
+            Rasterizer::Cpu => None,
+            Rasterizer::Gpu(rasterizer) => Some(rasterizer.gpu()),
+        }
+    }
+
     /// Returns the name of the device that renders now: `CPU`, or the adapter.
     pub fn device(&self) -> String {
         match &self.rasterizer {

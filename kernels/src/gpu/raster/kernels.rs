@@ -6,7 +6,8 @@ pub(crate) static PROJECT: Kernel = Kernel {
     name: "project",
     entry: "main",
     source: wgsl!(
-        RasterUniform; "shared/grid", "shared/raster", "shared/sh", "shared/ewa", "raster/project"
+        RasterUniform; "shared/grid", "shared/finite", "shared/raster", "shared/sh", "shared/ewa",
+        "raster/project"
     ),
 };
 
@@ -94,7 +95,7 @@ pub(crate) static COLOUR_BWD: Kernel = Kernel {
     name: "colour_bwd",
     entry: "main",
     source: wgsl!(
-        RasterUniform; "shared/grid", "shared/raster", "shared/sh", "shared/sh_bwd",
+        RasterUniform; "shared/grid", "shared/finite", "shared/raster", "shared/sh", "shared/sh_bwd",
         "shared/moments", "raster/colour_bwd"
     ),
 };

@@ -90,6 +90,17 @@ impl Rasterizer {
         self
     }
 
+    /// Returns the capacity for (splat, tile) pairs.
+    pub(crate) fn capacity(&self) -> usize {
+        self.capacity
+    }
+
+    /// Sets the capacity, and the start value of new rasterizers where it is larger than theirs.
+    pub(crate) fn set_capacity(&mut self, pairs: usize) {
+        self.capacity = pairs;
+        self.gpu.pairs.fetch_max(pairs, Relaxed);
+    }
+
     /// Returns the GPU.
     pub fn gpu(&self) -> &Arc<Gpu> {
         &self.gpu
@@ -229,8 +240,7 @@ impl Rasterizer {
         self.pairs = pairs;
         self.pairs_exceed_binding = pairs > max_pairs;
         if pairs > self.capacity && !self.pairs_exceed_binding {
-            self.capacity = pairs.next_power_of_two().min(max_pairs);
-            self.gpu.pairs.fetch_max(self.capacity, Relaxed);
+            self.set_capacity(pairs.next_power_of_two().min(max_pairs));
         }
     }
 

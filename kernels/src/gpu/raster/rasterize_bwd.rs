@@ -88,6 +88,36 @@ struct PartReading {
     gain: Reading<f32>,
 }
 
+/// Gradients by the splats of a part of the scene, in device memory, in the layout of the part.
+pub(crate) struct PartGradients {
+    pub(crate) rows: Buffer,
+    pub(crate) sh: Buffer,
+    pub(crate) gain: Buffer,
+    /// Floats of the three.
+    floats: [usize; 3],
+}
+
+impl PartGradients {
+    /// Copies gradients by packed rows to the device.
+    pub(crate) fn upload(gpu: &Gpu, gradients: &Gradients) -> Result<Self, GpuError> {
+        let Gradients { rows, sh, gain, .. } = gradients;
+        let floats = [rows.len(), sh.len(), gain.len()];
+        let upload = |values: &[f32]| gpu.upload("gradients of splats", values);
+        Ok(Self { rows: upload(rows)?, sh: upload(sh)?, gain: upload(gain)?, floats })
+    }
+
+    /// Appends the read-back of the gradients.
+    fn read(&self, commands: &mut Commands) -> Result<PartReading, GpuError> {
+        let mut read = |buffer: &Buffer, floats| commands.read(buffer, floats);
+        let [rows, sh, gain] = self.floats;
+        Ok(PartReading {
+            rows: read(&self.rows, rows)?,
+            sh: read(&self.sh, sh)?,
+            gain: read(&self.gain, gain)?,
+        })
+    }
+}
+
 impl Rasterizer {
     /// Renders into planes `[5, H, W]` as [`Rasterizer::render_planes`] does, and keeps the
     /// inputs of [`Frame::backward`].
@@ -185,24 +215,10 @@ impl Frame {
         let gpu = self.gpu.clone();
         let mut commands = gpu.commands("backward", self.timed);
         let upstream = gpu.upload("gradients of the picture", gradients)?;
-        let call = frame.call;
-        let (pairs, background) =
-            record_tiles(&mut commands, &gpu, frame, &call, self.pairs, &upstream)?;
-        let background = commands.read::<f32>(&background, 4 * tiles(&call))?;
-        let sums = gpu.empty::<f32>("sums of splats", PAIR_SUMS * self.scene.len)?;
-        let splats = SplatBuffers {
-            footprints: &frame.footprints,
-            depths: &frame.depths,
-            offsets: &frame.offsets,
-        };
-        sum_pairs(&mut commands, &gpu, &call, &splats, &pairs, &sums)?;
-        let parts = self.scene.parts.iter().map(|part| PartSums {
-            part,
-            footprints: frame.footprints.clone(),
-            sums: sums.clone(),
-            own: part.first,
-        });
-        let parts = self.record_splats(&mut commands, parts)?;
+        let (parts, background) =
+            record_backward(&mut commands, &gpu, &self.scene, frame, self.pairs, &upstream)?;
+        let background = commands.read::<f32>(&background, 4 * tiles(&frame.call))?;
+        let parts = parts.iter().map(|part| part.read(&mut commands)).collect::<Result<_, _>>()?;
         self.submit(commands)?;
         Ok(Pending { parts, background: vec![background] })
     }
@@ -233,7 +249,8 @@ impl Frame {
             sums,
             own: 0,
         });
-        let parts = self.record_splats(&mut commands, parts)?;
+        let parts = record_splats(&mut commands, &gpu, &scene, &self.call, parts)?;
+        let parts = parts.iter().map(|part| part.read(&mut commands)).collect::<Result<_, _>>()?;
         self.submit(commands)?;
         Ok(Pending { parts, background })
     }
@@ -285,51 +302,6 @@ impl Frame {
         background.ok_or(GpuError::TooSmall { resource: "layers of a band", needed: 1, limit: 0 })
     }
 
-    fn record_splats<'a>(
-        &self,
-        commands: &mut Commands,
-        parts: impl Iterator<Item = PartSums<'a>>,
-    ) -> Result<Vec<PartReading>, GpuError> {
-        commands.stage("project backward");
-        parts.map(|part| self.record_part(commands, &part)).collect()
-    }
-
-    fn record_part(
-        &self,
-        commands: &mut Commands,
-        PartSums { part, footprints, sums, own }: &PartSums,
-    ) -> Result<PartReading, GpuError> {
-        let (gpu, scene) = (&*self.gpu, &self.scene);
-        let call = RasterUniform {
-            first: part.first as u32,
-            count: part.count as u32,
-            own: *own as u32,
-            ..self.call
-        };
-        let own = gpu.uniform(&call)?;
-        let parents = part.count.div_ceil(scene.children);
-        let lengths = [
-            scene.stride * part.count,
-            scene.sh_stride() * parents,
-            scene.gain_stride * part.count,
-        ];
-        let [rows, sh, gain] = lengths.map(|n| gpu.empty::<f32>("gradients of splats", n));
-        let (rows, sh, gain) = (rows?, sh?, gain?);
-        let of = |buffer: &Buffer| Binding::from(buffer);
-        let bindings = [of(&own), part.rows.clone(), of(footprints), of(sums), of(&rows)];
-        commands.run(&PROJECT_BWD, &[], &bindings, Groups::of(part.count, THREADS))?;
-        let splats = [&part.rows, &part.sh, &part.gain].map(Clone::clone);
-        let results = bind([sums, &rows, &sh, &gain]);
-        let bindings = [vec![of(&own)], splats.into(), results.into()].concat();
-        commands.run(&COLOUR_BWD, &[], &bindings, Groups::of(parents, THREADS))?;
-        let [n, d, g] = lengths;
-        Ok(PartReading {
-            rows: commands.read(&rows, n)?,
-            sh: commands.read(&sh, d)?,
-            gain: commands.read(&gain, g)?,
-        })
-    }
-
     fn put_rows(&self, rows: Vec<f32>, out: &mut Gradients) {
         if self.scene.stride != COV6_STRIDE {
             out.rows = rows;
@@ -343,6 +315,76 @@ impl Frame {
             out.opacities.extend_from_slice(opacity);
         }
     }
+}
+
+/// Appends the backward pass of a frame that was drawn at once, with room for `pairs` pairs. `upstream`
+/// `[5, H, W]` is the gradient of the picture. Returns the gradients of each part, and `[tiles, 4]`,
+/// those of the background.
+pub(crate) fn record_backward(
+    commands: &mut Commands,
+    gpu: &Gpu,
+    scene: &Scene,
+    frame: &FrameBuffers,
+    pairs: usize,
+    upstream: &Buffer,
+) -> Result<(Vec<PartGradients>, Buffer), GpuError> {
+    let call = frame.call;
+    let (pairs, background) = record_tiles(commands, gpu, frame, &call, pairs, upstream)?;
+    let sums = gpu.empty::<f32>("sums of splats", PAIR_SUMS * scene.len)?;
+    let splats = SplatBuffers {
+        footprints: &frame.footprints,
+        depths: &frame.depths,
+        offsets: &frame.offsets,
+    };
+    sum_pairs(commands, gpu, &call, &splats, &pairs, &sums)?;
+    let parts = scene.parts.iter().map(|part| PartSums {
+        part,
+        footprints: frame.footprints.clone(),
+        sums: sums.clone(),
+        own: part.first,
+    });
+    Ok((record_splats(commands, gpu, scene, &call, parts)?, background))
+}
+
+/// Appends the gradients of all parts' splats from their sums.
+fn record_splats<'a>(
+    commands: &mut Commands,
+    gpu: &Gpu,
+    scene: &Scene,
+    call: &RasterUniform,
+    parts: impl Iterator<Item = PartSums<'a>>,
+) -> Result<Vec<PartGradients>, GpuError> {
+    commands.stage("project backward");
+    parts.map(|part| record_part(commands, gpu, scene, call, &part)).collect()
+}
+
+fn record_part(
+    commands: &mut Commands,
+    gpu: &Gpu,
+    scene: &Scene,
+    call: &RasterUniform,
+    PartSums { part, footprints, sums, own }: &PartSums,
+) -> Result<PartGradients, GpuError> {
+    let call = RasterUniform {
+        first: part.first as u32,
+        count: part.count as u32,
+        own: *own as u32,
+        ..*call
+    };
+    let own = gpu.uniform(&call)?;
+    let parents = part.count.div_ceil(scene.children);
+    let floats =
+        [scene.stride * part.count, scene.sh_stride() * parents, scene.gain_stride * part.count];
+    let [rows, sh, gain] = floats.map(|n| gpu.empty::<f32>("gradients of splats", n));
+    let (rows, sh, gain) = (rows?, sh?, gain?);
+    let of = |buffer: &Buffer| Binding::from(buffer);
+    let bindings = [of(&own), part.rows.clone(), of(footprints), of(sums), of(&rows)];
+    commands.run(&PROJECT_BWD, &[], &bindings, Groups::of(part.count, THREADS))?;
+    let splats = [&part.rows, &part.sh, &part.gain].map(Clone::clone);
+    let results = bind([sums, &rows, &sh, &gain]);
+    let bindings = [vec![of(&own)], splats.into(), results.into()].concat();
+    commands.run(&COLOUR_BWD, &[], &bindings, Groups::of(parents, THREADS))?;
+    Ok(PartGradients { rows, sh, gain, floats })
 }
 
 /// Returns the gradients of a band's pixels `[6, rows, W]`: its rows of `whole` `[5, H, W]`, and

@@ -81,10 +81,12 @@ macro_rules! uniform {
     };
 }
 
+mod finish;
 mod network;
 mod raster;
 mod spgr;
 
+pub use finish::{LossUniform, OptimiseUniform};
 pub use network::{
     AdamUniform, AdapterUniform, AttentionGatherUniform, AttentionUniform, AttributesUniform,
     ConvexUniform, ConvolutionUniform, CrossCheckUniform, DepthConsensusUniform,
