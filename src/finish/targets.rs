@@ -54,14 +54,11 @@ pub(super) fn whole<'a>(views: &[TargetView<'a>]) -> Vec<MaskedView<'a>> {
 /// pixel grows linearly to 1.
 pub(super) const COVERAGE_MIN: f32 = 0.7;
 
-/// A view with its truth as planes.
+/// A view with its truth, which each loss converts to planes: those of fifty photographs of 0.27 megapixels are 160 MB.
 pub(super) struct Target<'a> {
     pub camera: &'a Camera,
     /// The picture.
-    #[cfg(feature = "gpu")]
     image: &'a Rgb,
-    /// `[3, H, W]`.
-    pub truth: Vec<f32>,
     /// Pixels that count.
     mask: Option<&'a Mask>,
     weights: LossWeights,
@@ -81,7 +78,7 @@ impl<'a> Target<'a> {
         Ok(())
     }
 
-    /// Converts a picture to planes.
+    /// The target of a view.
     ///
     /// # Errors
     /// Those of [`Target::check`].
@@ -91,14 +88,7 @@ impl<'a> Target<'a> {
         weights: LossWeights,
     ) -> Result<Self, FinishError> {
         Self::check(index, view)?;
-        Ok(Self {
-            camera: view.camera,
-            #[cfg(feature = "gpu")]
-            image: view.image,
-            truth: view.image.to_planes(),
-            mask: view.mask,
-            weights,
-        })
+        Ok(Self { camera: view.camera, image: view.image, mask: view.mask, weights })
     }
 
     /// Copies the picture and its mask to a GPU.
@@ -111,20 +101,24 @@ impl<'a> Target<'a> {
         gpu.target_picture(data, self.mask.map(Mask::kept), [*width, *height])
     }
 
+    /// The picture as planes `[3, H, W]`.
+    fn truth(&self) -> Vec<f32> {
+        self.image.to_planes()
+    }
+
     /// The loss of rendered planes `[5, H, W]`, with its gradient by R, G and B.
     pub fn loss(&self, planes: &[f32]) -> Scored {
-        self.loss_to(planes, &self.truth)
+        self.loss_to(planes, self.truth())
     }
 
     /// [`Target::loss`] with another `truth`. Masked pixels have no weight: the truth is the rendered picture there,
     /// and their gradient is 0. A window of SSIM that they share with others counts as a whole.
-    fn loss_to(&self, planes: &[f32], truth: &[f32]) -> Scored {
-        let Some(mask) = self.mask else { return self.loss_of_all(planes, truth) };
+    fn loss_to(&self, planes: &[f32], mut truth: Vec<f32>) -> Scored {
+        let Some(mask) = self.mask else { return self.loss_of_all(planes, &truth) };
         let kept = mask.kept();
-        let masked = || (0..truth.len()).filter(|i| !kept[i % kept.len()]);
-        let mut seen = truth.to_vec();
-        masked().for_each(|i| seen[i] = planes[i]);
-        let mut loss = self.loss_of_all(planes, &seen);
+        let masked = || (0..3 * kept.len()).filter(|i| !kept[i % kept.len()]);
+        masked().for_each(|i| truth[i] = planes[i]);
+        let mut loss = self.loss_of_all(planes, &truth);
         masked().for_each(|i| loss.gradient[i] = 0.0);
         loss.scaled(kept.len() as f64 / mask.count().max(1) as f64)
     }
@@ -142,22 +136,23 @@ impl<'a> Target<'a> {
 
     /// [`Target::loss`] where Gaussians cover the picture.
     pub fn loss_where_covered(&self, planes: &[f32]) -> Scored {
-        let mut truth = self.truth.clone();
+        let mut truth = self.truth();
         let pixels = truth.len() / 3;
         for (i, weight) in coverage_weights(planes, pixels).enumerate() {
             for j in [i, i + pixels, i + 2 * pixels] {
                 truth[j] = planes[j] + weight * (truth[j] - planes[j]);
             }
         }
-        self.loss_to(planes, &truth)
+        self.loss_to(planes, truth)
     }
 
     /// Mean squared difference of rendered planes `[5, H, W]`.
     pub fn error(&self, planes: &[f32]) -> f64 {
+        let truth = self.truth();
         let Some(mask) = self.mask else {
-            return mse(&planes[..self.truth.len()], &self.truth).value;
+            return mse(&planes[..truth.len()], &truth).value;
         };
-        let pixels = mask.kept().iter().cycle().zip(planes.iter().zip(&self.truth));
+        let pixels = mask.kept().iter().cycle().zip(planes.iter().zip(&truth));
         let squares = pixels.filter(|(kept, _)| **kept).map(|(_, (a, b))| f64::from(a - b).powi(2));
         squares.sum::<f64>() / (3 * mask.count()).max(1) as f64
     }
@@ -165,14 +160,15 @@ impl<'a> Target<'a> {
     /// Mean squared difference of planes `[5, H, W]` where Gaussians cover the picture, 0 where they
     /// cover nothing, and the share of the picture that they cover.
     pub fn error_where_covered(&self, planes: &[f32]) -> [f64; 2] {
-        let pixels = self.truth.len() / 3;
+        let truth = self.truth();
+        let pixels = truth.len() / 3;
         let (mut sum, mut weights) = (0.0, 0.0);
         let counted = self.mask.map_or(pixels, Mask::count);
         let is_kept = |i: usize| self.mask.is_none_or(|mask| mask.kept()[i]);
         let covered = coverage_weights(planes, pixels).enumerate().filter(|(i, _)| is_kept(*i));
         for (i, weight) in covered {
             let elements = [i, i + pixels, i + 2 * pixels];
-            let squares = elements.map(|j| f64::from(planes[j] - self.truth[j]).powi(2));
+            let squares = elements.map(|j| f64::from(planes[j] - truth[j]).powi(2));
             sum += f64::from(weight) * squares.iter().sum::<f64>();
             weights += 3.0 * f64::from(weight);
         }
@@ -287,7 +283,8 @@ mod tests {
         // The difference alone is the mean over the pixels that count.
         let own = target(&camera, &image, Some(&mask), 0.0);
         let kept = |i: usize| mask.kept()[i % pixels];
-        let difference = |i: usize| f64::from(planes[i] - own.truth[i]);
+        let truth = own.truth();
+        let difference = |i: usize| f64::from(planes[i] - truth[i]);
         let mean = (0..3 * pixels).filter(|i| kept(*i)).map(|i| difference(i).powi(2)).sum::<f64>()
             / (3 * mask.count()) as f64;
         assert!((own.error(&planes) / mean - 1.0).abs() < 1e-9);
