@@ -254,11 +254,11 @@ fn steps_end_where_the_error_no_longer_falls() {
 fn a_time_limit_ends_the_steps_and_their_rates() {
     let truth = pictures(&plane(0.6, 0.9));
     let mut splats = displaced(0.4);
-    let options = RefineOptions::default().with_time(Duration::from_millis(300));
+    let options = RefineOptions::default().with_time(Duration::from_secs(2));
     let begun = Instant::now();
     let report = refined(&mut splats, &truth, &options);
     assert!(report.steps > 0 && report.after < report.before, "{report:?}");
-    // A hundred times the limit, whatever else the machine does.
+    // Fifteen times the limit, whatever else the machine does.
     assert!(begun.elapsed() < Duration::from_secs(30));
 }
 
