@@ -207,6 +207,7 @@ impl Reconstructor {
             inputs.iter().zip(sizes).map(|(c, size)| cut_share(c, size)).collect();
         warnings.extend(Warning::of_crops(photos, &inputs, &cut_shares, &crop));
         warnings.extend(corrected);
+        warnings.extend(Warning::of_masks(photos));
         if self.missing > 0 {
             let upscale = self.config().upscale;
             warnings.push(Warning::UntrainedTensors { count: self.missing, upscale });

@@ -3,6 +3,7 @@
 use super::{DepthBounds, Photo};
 use crate::cameras::check::{Finding, PairReport, Verdict};
 use crate::reconstruct::inputs::crop::{CropOptions, Cropped};
+use crate::scene::mask::Mask;
 use std::collections::BTreeSet;
 use std::fmt;
 use subsplat_kernels::camera::Size;
@@ -32,7 +33,7 @@ pub enum Warning {
         /// Farthest depth candidate, world units.
         far: f32,
     },
-    /// Most points that the photographs share lie outside of the depth range.
+    /// A quarter or more of the points that the photographs share lies before or behind the depth range.
     #[non_exhaustive]
     PointsOutsideRange {
         /// Nearest depth candidate, world units.
@@ -51,6 +52,14 @@ pub enum Warning {
         used: Size,
         /// The model's stride, px.
         stride: usize,
+    },
+    /// Masks leave out pixels of photographs.
+    #[non_exhaustive]
+    Masked {
+        /// Number of photographs with a mask.
+        photographs: usize,
+        /// Share of their pixels that is left out, 0 to 1.
+        share: f32,
     },
     /// A photograph is smaller than the target picture, and was enlarged.
     #[non_exhaustive]
@@ -119,13 +128,20 @@ impl fmt::Display for Warning {
             ),
             Self::PointsOutsideRange { near, far, points: [low, high] } => write!(
                 f,
-                "most points that the photographs share are {low:.4} to {high:.4} away, outside of the range from \
-                 {near:.4} to {far:.4} in which distances are searched: shapes will be wrong; --near and --far set it"
+                "points that the photographs share are {low:.4} to {high:.4} away, and a quarter of them or more is outside \
+                 of the range from {near:.4} to {far:.4} in which distances are searched: shapes will be wrong; --near \
+                 and --far set it"
             ),
             Self::InputSizeCut { requested, used, stride } => write!(
                 f,
                 "the photographs are read at {used} instead of {requested}: both sides must be \
                  multiples of {stride} pixels"
+            ),
+            Self::Masked { photographs, share } => write!(
+                f,
+                "masks leave out {:.0} % of the pixels of {photographs} photographs (what is black in a mask file, or \
+                 transparent, is left out)",
+                100.0 * share
             ),
             Self::PhotographEnlarged { size, resized } => write!(
                 f,
@@ -246,12 +262,21 @@ impl Warning {
         warnings
     }
 
-    /// A warning where the median depth of the points of most pairs with some lies outside of `bounds`.
+    /// A line about the masks of `photos`, where they have some.
+    pub(super) fn of_masks(photos: &[Photo]) -> Option<Self> {
+        let masks: Vec<&Mask> = photos.iter().filter_map(Photo::mask).collect();
+        let pixels: usize = masks.iter().map(|mask| mask.width() * mask.height()).sum();
+        let kept: usize = masks.iter().map(|mask| mask.count()).sum();
+        let share = 1.0 - kept as f32 / pixels.max(1) as f32;
+        (!masks.is_empty()).then_some(Self::Masked { photographs: masks.len(), share })
+    }
+
+    /// A warning where a quarter or more of the points of most pairs with some lies before or behind `bounds`.
     pub(super) fn of_points(bounds: &DepthBounds, reports: &[PairReport]) -> Option<Self> {
         let DepthBounds { near, far, .. } = *bounds;
         let usable = reports.iter().filter(|report| report.verdict != Verdict::Bad);
         let depths: Vec<[f32; 5]> = usable.filter_map(|r| Some(r.depth?.quantiles)).collect();
-        let mut outside = depths.iter().filter(|[_, _, median, ..]| !(near..=far).contains(median));
+        let mut outside = depths.iter().filter(|[_, low, _, high, _]| *low < near || *high > far);
         let count = outside.clone().count();
         let [low, .., high] = *outside.next().filter(|_| 2 * count > depths.len())?;
         Some(Self::PointsOutsideRange { near, far, points: [low, high] })
@@ -339,7 +364,9 @@ mod tests {
         let text = found.to_string();
         assert!(text.contains("1.5000 to 6.0000 away") && text.contains("20.0000"), "{text}");
         assert!(of(&[good(80.0)]).is_some());
-        for reports in [&[][..], &[good(20.0)], &[good(3.0), good(30.0)]] {
+        // A quarter is nearer.
+        assert!(of(&[good(24.0)]).is_some());
+        for reports in [&[][..], &[good(30.0)], &[good(3.0), good(30.0)]] {
             assert_eq!(of(reports), None);
         }
         assert_eq!(of(&[report(3.0, Verdict::Bad), PairReport::default()]), None);

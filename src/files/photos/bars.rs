@@ -1,5 +1,6 @@
-//! Black bars at the edges of a picture: of films, of videos of another shape, and of pictures that were padded. They
-//! are no part of what the camera saw, so they are masked.
+//! Black bars at two opposite edges of a picture: of films, and of videos of another shape. They are no part of what the
+//! camera saw, so they are masked. A bar at one edge stays: a dark wall or a sky at night may be one, and the centre of
+//! the lens would not be that of the picture.
 
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
@@ -16,6 +17,8 @@ const BLENDED: usize = 8;
 /// Share of the picture's side, and px, above which a bar counts: narrower ones are the frame that a removal of lens
 /// distortion leaves, which is filled (`reconstruct/inputs/frame.rs`).
 const LEAST: (f64, usize) = (0.01, 4);
+/// Largest difference of the two bars, of the picture's side, and px.
+const DIFFERENCE: (f64, usize) = (0.01, 3);
 /// Widest bars of both sides together, of the picture's side.
 const MOST: f64 = 0.8;
 
@@ -96,7 +99,9 @@ fn ends(count: usize, line: impl Fn(usize) -> Line) -> [usize; 2] {
         behind.map_or(0, |first| first.max(black + 1))
     };
     let [first, last] = [width(&|i| i), width(&|i| count - 1 - i)];
-    if first + last > most { [0, 0] } else { [first, last] }
+    let differ = ((count as f64 * DIFFERENCE.0) as usize).max(DIFFERENCE.1);
+    let are_two = first > 0 && last > 0 && first.abs_diff(last) <= differ;
+    if are_two && first + last <= most { [first, last] } else { [0, 0] }
 }
 
 #[cfg(test)]
@@ -125,7 +130,8 @@ mod tests {
         let letterbox = bars(&picture(size, 0..200, 20..101));
         assert_eq!(letterbox, Bars { top: 21, bottom: 20, ..Bars::default() });
         let padded = bars(&picture(size, 0..150, 0..120));
-        assert_eq!(padded, Bars { right: 51, ..Bars::default() });
+        assert_eq!(padded, Bars::default());
+        assert_eq!(bars(&picture(size, 0..200, 10..90)), Bars::default());
         let both = bars(&picture(size, 30..170, 10..110));
         assert_eq!(both, Bars { top: 11, bottom: 11, left: 31, right: 31 });
         let (mask, line) = both.mask(200, 120).unwrap();
@@ -133,7 +139,7 @@ mod tests {
         assert!(line.contains(": top, bottom, left, right"), "{line}");
         assert_eq!(Bars::default().mask(200, 120), None);
         // A blended line between them.
-        let mut blended = picture(size, 0..200, 20..120);
+        let mut blended = picture(size, 0..200, 20..100);
         blended.data[3 * 200 * 19..3 * 200 * 20].fill(20);
         assert_eq!(bars(&blended).top, 20);
     }
@@ -142,12 +148,12 @@ mod tests {
     fn dark_photographs_have_no_bars() {
         let size = [200, 120];
         // Too narrow; nothing but black; an object on black.
-        assert_eq!(bars(&picture(size, 0..200, 2..120)), Bars::default());
+        assert_eq!(bars(&picture(size, 0..200, 2..118)), Bars::default());
         assert_eq!(bars(&picture(size, 0..0, 0..0)), Bars::default());
         let object = picture(size, 60..110, 30..90);
         assert_eq!(bars(&object), Bars::default());
-        // A sky at night above uneven roofs.
-        let mut roofs = picture(size, 0..200, 40..120);
+        // A sky at night above uneven roofs, and a dark street.
+        let mut roofs = picture(size, 0..200, 40..80);
         for x in 0..200 {
             for y in 40..40 + x % 50 {
                 roofs.data[3 * (y * 200 + x)..][..3].fill(2);

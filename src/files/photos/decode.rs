@@ -3,8 +3,8 @@
 //! Steps: detect the format by content, refuse truncated JPEG files and CMYK of unknown
 //! polarity, decode (`reduced.rs` beyond 100 megapixels, `converted.rs` what no decoder here reads), bring samples
 //! of 16 bits and of floating point to one range (`ranges.rs` has the rule), convert an embedded ICC profile to
-//! sRGB, make a mask of an alpha channel or of black bars (`bars.rs`), or blend transparency with black, round to 8
-//! bits.
+//! sRGB, make a mask of an alpha channel or blend transparency with black, round to 8 bits. Black bars of photographs
+//! are masked (`bars.rs`).
 //!
 //! A fourth band of a TIFF is an alpha by its `ExtraSamples`: 0 (unspecified) is none, 1 is one by which the colours are
 //! multiplied, 2 is one by which they are not. Without the tag it is read as 2, as OpenCV and others write it.
@@ -221,14 +221,28 @@ pub(super) fn decode<'a>(
     {
         note(&format!("the ICC profile is ignored and the colours are read as sRGB: {reason}"));
     }
-    let (picture, mut mask) = to_rgb(pixels);
+    let (picture, mask) = to_rgb(pixels);
     if mask.is_some() {
         note("the alpha channel is used as a mask: pixels with an alpha below 128 are left out");
-    } else if let Some((bars, line)) = bars(&picture).mask(picture.width, picture.height) {
-        note(&line);
-        mask = Some(bars);
     }
     Ok(Decoded { picture, mask, orientation, exif, panorama, warnings })
+}
+
+/// [`decode`] of a photograph: black bars at its edges are masked.
+pub(super) fn decode_photograph<'a>(
+    bytes: &'a [u8],
+    options: &LoadOptions,
+    path: &Path,
+) -> Result<Decoded<'a>> {
+    let mut decoded = decode(bytes, options, path)?;
+    let Rgb { width, height, .. } = decoded.picture;
+    if decoded.mask.is_none()
+        && let Some((bars, line)) = bars(&decoded.picture).mask(width, height)
+    {
+        decoded.warnings.push(format!("{}: {line}", path.display()));
+        decoded.mask = Some(bars);
+    }
+    Ok(decoded)
 }
 
 /// Decodes a format of the `image` crate.

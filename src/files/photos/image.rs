@@ -8,7 +8,7 @@
 //! EXIF orientation is reported here and never applied, because pose files refer to the
 //! stored pixels. `photograph.rs` applies it.
 
-use super::decode::{self, decode, decoder};
+use super::decode::{self, decode, decode_photograph, decoder};
 use crate::files::{Error, Result, read, write_atomic};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::{Depth, Rgb};
@@ -101,7 +101,7 @@ pub fn load(path: impl AsRef<Path>) -> Result<Rgb> {
 pub fn load_with(path: impl AsRef<Path>, options: &LoadOptions) -> Result<LoadedPicture> {
     let path = path.as_ref();
     let bytes = read(path)?;
-    let decoded = decode(&bytes, options, path)?;
+    let decoded = decode_photograph(&bytes, options, path)?;
     Ok(LoadedPicture { picture: decoded.picture, mask: decoded.mask, warnings: decoded.warnings })
 }
 

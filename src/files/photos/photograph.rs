@@ -6,7 +6,7 @@
 //!
 //! ICC profiles are applied to both kinds of pictures: a wrong colour is wrong for every reader.
 
-use super::decode::{self, Header, decode};
+use super::decode::{self, Header, decode_photograph};
 use super::exif::{ExifCamera, ExifReport, Shot, parse_exif};
 use super::image::{LoadOptions, Probe};
 use super::masks;
@@ -191,7 +191,7 @@ fn decode_upright(
     path: &Path,
     mask_file: Option<&Path>,
 ) -> Result<PhotographOrPanorama> {
-    let decoded = decode(bytes, options, path)?;
+    let decoded = decode_photograph(bytes, options, path)?;
     let Rgb { width, height, .. } = decoded.picture;
     let mut report = report(decoded.exif.as_deref(), width, height, path);
     if decoded.panorama {

@@ -1,10 +1,13 @@
 //! Pictures of a folder that are no photographs of their own: the same one in another format, a copy, an edited
-//! version or another exposure of it, its mask, and maps of it such as depths.
+//! version or another exposure of it, its mask, and maps of it such as depths. Names and EXIF suggest them, and the
+//! pixels decide.
 
 use super::exif::Shot;
 use super::photograph::PhotographHeader;
 use super::raw;
 use crate::files::lower_extension;
+use crate::files::photos::image::load;
+use crate::scene::pictures::Rgb;
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
@@ -40,13 +43,26 @@ const COLOURS: [&str; 6] = ["rgb", "color", "colour", "image", "img", "frame"];
 /// Ends of the names of edited versions: Google, Lightroom, Samsung.
 const EDITED: [&str; 7] =
     ["-edited", "_edited", " (edited)", "-edit", "_edit", "-bearbeitet", "~2"];
+/// Side of the small pictures that are compared, px.
+const SMALL: usize = 48;
+/// Least correlation of two small pictures of one view. Exposures two stops apart have 0.92, photographs of somebody who
+/// walks 0.73 at most.
+const SAME_VIEW: f64 = 0.85;
+/// Largest difference of the channels of a grey pixel, and least share of such pixels in a grey picture: a JPEG has noise.
+const GREY: (u8, f64) = (12, 0.99);
+/// Distance of a mask's values from black or white, and least share of such pixels.
+const TWO_VALUES: (u8, f64) = (32, 0.95);
+/// Mean red, green and blue of a map of normals that face the camera, and the largest difference from them.
+const NORMALS: ([f64; 3], f64) = ([128.0, 128.0, 220.0], 45.0);
+/// Most colours of a map of labels.
+const LABELS_MAX: usize = 256;
 /// Longest time between two exposures of one view, seconds: the tag has whole seconds.
 const SERIES_SECONDS: f64 = 2.0;
 /// Fewest exposures of one view.
 const SERIES_LEAST: usize = 3;
 
 /// Reasons, the same for all files of a kind: one line names them.
-const IS_MASK: &str = "the mask of a photograph beside it";
+const IS_MASK: &str = "the mask of a photograph beside it, which it is applied to";
 const IS_MAP: &str = "a map of a photograph beside it, such as depths or normals";
 const IS_EDITED: &str = "an edited version of a photograph beside it";
 const IS_EXPOSURE: &str = "another exposure of a photograph beside it, by EXIF";
@@ -145,11 +161,84 @@ fn maps(all: &[Found]) -> LeftOut {
         .map(|((words, _), found)| (words.as_slice(), found.path.as_path()))
         .collect();
     let of_map = |(i, (words, is_map)): (usize, &(Vec<String>, bool))| {
-        let of = plain.get(words.as_slice()).filter(|_| *is_map)?;
+        let of = plain.get(words.as_slice()).filter(|of| *is_map && is_map_of(&all[i].path, of))?;
         let is_mask = mask_beside(of).is_some_and(|mask| mask == all[i].path);
         Some((i, if is_mask { IS_MASK } else { IS_MAP }.to_owned()))
     };
     named.iter().enumerate().filter_map(of_map).collect()
+}
+
+/// Returns whether the pixels of `path` can be those of a map of the photograph `of`: two values, few colours, the colours
+/// of normals, or grey beside a photograph with colours.
+fn is_map_of(path: &Path, of: &Path) -> bool {
+    let Ok(map) = load(path) else { return false };
+    let is_other = || is_grey(&map) && load(of).is_ok_and(|photograph| !is_grey(&photograph));
+    has_two_values(&map) || has_few_colours(&map) || has_normals(&map) || is_other()
+}
+
+fn share(picture: &Rgb, counts: impl Fn(&[u8]) -> bool) -> f64 {
+    let pixels = picture.data.chunks_exact(3);
+    pixels.filter(|pixel| counts(pixel)).count() as f64 * 3.0 / picture.data.len().max(1) as f64
+}
+
+fn is_grey(picture: &Rgb) -> bool {
+    let (most, least) = GREY;
+    let range = |p: &[u8]| p.iter().max().zip(p.iter().min()).map_or(0, |(high, low)| high - low);
+    share(picture, |p| range(p) <= most) >= least
+}
+
+/// Returns whether a picture is grey and nearly all of it black or white.
+fn has_two_values(picture: &Rgb) -> bool {
+    let (near, least) = TWO_VALUES;
+    is_grey(picture) && share(picture, |p| p[1] <= near || p[1] >= u8::MAX - near) >= least
+}
+
+fn has_few_colours(picture: &Rgb) -> bool {
+    let mut colours = HashSet::new();
+    !is_grey(picture)
+        && picture.data.chunks_exact(3).all(|p| colours.insert(p) || colours.len() <= LABELS_MAX)
+        && colours.len() <= LABELS_MAX
+}
+
+fn has_normals(picture: &Rgb) -> bool {
+    let pixels = (picture.data.len() / 3).max(1) as f64;
+    let mean = |c: usize| {
+        picture.data.iter().skip(c).step_by(3).map(|v| f64::from(*v)).sum::<f64>() / pixels
+    };
+    let (usual, most) = NORMALS;
+    (0..3).all(|c| (mean(c) - usual[c]).abs() <= most)
+}
+
+/// Returns whether two files show one view, whatever their exposure.
+fn show_one_view(a: &Path, b: &Path) -> bool {
+    let small = |path: &Path| load(path).ok().map(|picture| small(&picture));
+    small(a).zip(small(b)).is_some_and(|(a, b)| correlation(&a, &b) >= SAME_VIEW)
+}
+
+/// Grey values of a picture of [`SMALL`] by [`SMALL`] blocks, less their mean.
+fn small(picture: &Rgb) -> Vec<f64> {
+    let Rgb { width, height, ref data } = *picture;
+    let block = |i: usize| {
+        let range = |n: usize, side: usize| {
+            let from = n * side / SMALL;
+            from..((n + 1) * side / SMALL).max(from + 1).min(side.max(1))
+        };
+        let (columns, rows) = (range(i % SMALL, width), range(i / SMALL, height));
+        let count = (columns.len() * rows.len()).max(1) as f64;
+        let line = |y: usize| {
+            let line = &data[3 * (y * width + columns.start)..3 * (y * width + columns.end)];
+            line.iter().map(|v| f64::from(*v)).sum::<f64>()
+        };
+        rows.map(line).sum::<f64>() / count
+    };
+    let values: Vec<f64> = (0..SMALL * SMALL).map(block).collect();
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    values.into_iter().map(|v| v - mean).collect()
+}
+
+fn correlation(a: &[f64], b: &[f64]) -> f64 {
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    product(a, b) / (product(a, a) * product(b, b)).sqrt().max(1e-9)
 }
 
 /// The mask of a photograph in its own folder: `a_mask.png` or `mask_a.png` of `a.jpg`, `a_mask.png` of `a_rgb.png`.
@@ -171,14 +260,19 @@ pub(super) fn mask_beside(image: &Path) -> Option<PathBuf> {
     let names = stems
         .iter()
         .flat_map(|stem| MASK_EXTENSIONS.map(|extension| format!("{stem}.{extension}")));
-    names.map(|name| image.with_file_name(name)).find(|path| path != image && path.is_file())
+    let is_mask = |path: &PathBuf| {
+        path != image && path.is_file() && load(path).is_ok_and(|mask| has_two_values(&mask))
+    };
+    names.map(|name| image.with_file_name(name)).find(is_mask)
 }
 
 /// Edited versions beside the photograph itself. They may be cropped, and have other colours.
 fn edited(all: &[Found]) -> LeftOut {
-    let stems: HashSet<String> = all.iter().map(|found| stem(&found.path)).collect();
+    let stems: HashMap<String, &Path> =
+        all.iter().map(|found| (stem(&found.path), found.path.as_path())).collect();
     let of_version = |(i, found): (usize, &Found)| {
-        stems.contains(&original(&stem(&found.path))?).then(|| (i, IS_EDITED.to_owned()))
+        let original = stems.get(&original(&stem(&found.path))?)?;
+        show_one_view(original, &found.path).then(|| (i, IS_EDITED.to_owned()))
     };
     all.iter().enumerate().filter_map(of_version).collect()
 }
@@ -191,8 +285,13 @@ fn original(stem: &str) -> Option<String> {
     of_apple.or_else(|| EDITED.iter().find_map(|end| Some(stem.strip_suffix(end)?.to_owned())))
 }
 
-/// Series of exposures from one place, by EXIF: the one nearest to the measured exposure stays.
+/// Series of exposures from one place: the one nearest to the measured exposure stays.
 fn exposures(all: &[Found]) -> LeftOut {
+    exposures_where(all, |i, j| show_one_view(&all[i].path, &all[j].path))
+}
+
+/// [`exposures`] of photographs of which `same_view` tells those from one place.
+fn exposures_where(all: &[Found], same_view: impl Fn(usize, usize) -> bool) -> LeftOut {
     let shot = |i: usize| all[i].header.shot;
     let timed = all.iter().enumerate().filter_map(|(i, found)| Some((i, found.header.shot?)));
     let mut timed: Vec<(usize, Shot)> = timed.collect();
@@ -224,8 +323,12 @@ fn exposures(all: &[Found]) -> LeftOut {
     let mut out = LeftOut::new();
     for series in series.iter().filter(|series| series.len() >= SERIES_LEAST) {
         let middle = series.iter().min_by(|&&i, &&j| bias(i).abs().total_cmp(&bias(j).abs()));
-        let others = series.iter().filter(|i| Some(*i) != middle);
-        out.extend(others.map(|&i| (i, IS_EXPOSURE.to_owned())));
+        let Some(&middle) = middle else { continue };
+        let mut others = series.iter().copied().filter(|i| *i != middle);
+        // Somebody who walks changes the exposure too.
+        if others.clone().all(|i| same_view(middle, i)) {
+            out.extend(others.by_ref().map(|i| (i, IS_EXPOSURE.to_owned())));
+        }
     }
     out
 }
@@ -234,6 +337,7 @@ fn exposures(all: &[Found]) -> LeftOut {
 mod tests {
     use super::*;
     use crate::files::photos::exif::ExifCamera;
+    use crate::files::photos::image::save_png;
 
     fn found(path: &Path, shot: Option<Shot>) -> Found {
         let header = PhotographHeader {
@@ -248,12 +352,35 @@ mod tests {
         Found { path: path.to_owned(), header }
     }
 
-    /// What is left out of files of these names with different bytes.
+    /// A picture whose content its name tells: a mask of two values, normals, labels, a grey map, else a photograph
+    /// with colours; of each first letter another one, edited ones a little brighter.
+    fn picture(name: &str) -> Rgb {
+        let name = name.to_lowercase();
+        let own = name.trim_start_matches("rgb_").bytes().find(u8::is_ascii_alphanumeric);
+        let own = usize::from(own.unwrap_or(0)) + 60 * usize::from(name.contains("photo"));
+        let is = |word: &str| name.contains(word) && !name.contains("photo");
+        let light = if is("edited") || name.starts_with("img_e") { 25 } else { 0 };
+        let value = |i: usize| {
+            let (x, y) = (i % 24, i / 24);
+            let of = |n: usize| ((x * (own + n) + y * (2 * own + n) + x * y * own) % 200) as u8;
+            match () {
+                () if is("mask") => [u8::from(x > 9) * 255; 3],
+                () if is("normal") => [120, 130, 230],
+                () if is("seg") => [[200, 10, 40], [10, 200, 90]][x % 2],
+                () if is("depth") => [(10 * x) as u8; 3],
+                () => [of(1) + light, of(3) + light, of(7) + light],
+            }
+        };
+        Rgb { width: 24, height: 18, data: (0..24 * 18).flat_map(value).collect() }
+    }
+
+    /// What is left out of files of these names.
     fn left_out(names: &[&str]) -> Vec<[String; 2]> {
         let folder = tempfile::tempdir().unwrap();
         let files = names.iter().map(|name| {
             let path = folder.path().join(name);
-            std::fs::write(&path, name).unwrap();
+            save_png(folder.path().join("x.png"), &picture(name)).unwrap();
+            std::fs::rename(folder.path().join("x.png"), &path).unwrap();
             found(&path, None)
         });
         sorted_out(files.collect()).1
@@ -272,6 +399,22 @@ mod tests {
             ),
             // Masks that have words of their own: not the one that is read.
             (&["a.jpg", "a_dog_mask.png", "b_mask.tif", "b.jpg"], &[("b_mask.tif", IS_MAP)]),
+            // Photographs with such names.
+            (&["a.jpg", "a_mask photo.jpg", "mask photo_a.jpg", "b.jpg", "b_depth_photo.jpg"], &[]),
+            // Another photograph under the name of an edited version.
+            (
+                &[
+                    "img_12.jpg",
+                    "c.jpg",
+                    "c-edited.jpg",
+                    "img_e12.jpg",
+                    "d photo-edit.jpg",
+                    "d.jpg",
+                ],
+                &[("c-edited.jpg", IS_EDITED), ("img_e12.jpg", IS_EDITED)],
+            ),
+            // Labels.
+            (&["a.jpg", "a_seg.png"], &[("a_seg.png", IS_MAP)]),
             // Photographs of masks, and a map alone.
             (&["mask.jpg", "mask 2.jpg", "a_depth.png", "IMG_1.jpg", "img.jpg"], &[]),
             (
@@ -294,7 +437,9 @@ mod tests {
                 found(Path::new(&name), Some(Shot { seconds: *seconds, bias: *bias }))
             };
             let all: Vec<Found> = shots.iter().enumerate().map(shot).collect();
-            exposures(&all).into_iter().map(|(i, _)| i).collect::<Vec<_>>()
+            let one_place = exposures_where(&all, |_, _| true);
+            assert!(exposures_where(&all, |i, j| i.max(j) < 2).len() < one_place.len().max(1));
+            one_place.into_iter().map(|(i, _)| i).collect::<Vec<_>>()
         };
         // Two series, the second one right behind the first one.
         let two = [(0.0, 0.0), (0.0, -2.0), (1.0, 2.0), (2.0, 0.0), (3.0, -2.0), (3.0, 2.0)];

@@ -8,22 +8,28 @@ use crate::files::{first_bytes, lower_extension, read};
 use std::path::{Path, PathBuf};
 
 /// Projects whose cameras are read when their program has exported them: extension, maker and export.
-const PROJECTS: [[&str; 3]; 3] = [
+const PROJECTS: [[&str; 3]; 4] = [
     ["psx", "a Metashape project", "XML"],
     ["rcproj", "a RealityCapture project", "CSV"],
     ["rsproj", "a RealityScan project", "CSV"],
+    ["nvm", "a VisualSFM scene", "Bundler's bundle.out"],
 ];
 /// Files and folders: those that are there together, and their maker.
-const NAMES: [(&[&str], &str); 5] = [
+const NAMES: [(&[&str], &str); 7] = [
     (&["odometry.csv", "camera_matrix.csv"], "Stray Scanner"),
     (&["groundtruth.txt", "rgb.txt"], "TUM RGB-D, which has no intrinsics"),
     (&["sensors/trajectories.txt", "sensors/sensors.txt"], "Kapture: kapture_export_colmap.py"),
     (&["camera_path.json"], "a path of nerfstudio's viewer, which has no photographs"),
     (&["project.files"], "a Metashape project"),
+    (&["sfm_data.bin"], "OpenMVG's binary form"),
+    (&["sfm.abc"], "Meshroom's Alembic form"),
 ];
-/// End of the name of Pix4D's cameras, and the folders in which they lie.
-const PIX4D: (&str, [&str; 3]) =
-    ("_calibrated_external_camera_parameters.txt", ["", "params", "1_initial/params"]);
+/// Names of files with cameras that are read where their content allows it.
+const DAMAGED: [&str; 5] =
+    ["sfm_data.json", "cameras.sfm", "sfm.json", "cameras_sphere.npz", "cameras.npz"];
+/// Words of the names of Pix4D's cameras, and the folders in which they lie.
+const PIX4D: ([&str; 2], [&str; 3]) =
+    (["_calibrated_", "camera_parameters.txt"], ["", "params", "1_initial/params"]);
 /// Replica's trajectory, as NICE-SLAM has it.
 const REPLICA: &str = "traj.txt";
 /// Bytes from the start of a file in which a pose or a name space stands.
@@ -42,6 +48,9 @@ fn line(folder: &Path) -> Option<String> {
         Some(format!("{} is {maker}: export its cameras as {export}", path.display()))
     };
     if let Some(line) = own.iter().find_map(of_project) {
+        return Some(line);
+    }
+    if let Some(line) = damaged(folder) {
         return Some(line);
     }
     if let Some(path) = reality_capture(folder, &own) {
@@ -67,6 +76,20 @@ fn line(folder: &Path) -> Option<String> {
     ))
 }
 
+/// A line about a file that is called as cameras of OpenMVG, Meshroom or NeuS are, and has no content of theirs.
+fn damaged(folder: &Path) -> Option<String> {
+    let is_damaged = |path: &PathBuf| {
+        let bytes = || read(path).unwrap_or_default();
+        let archive = lower_extension(path) == "npz";
+        path.is_file() && (archive || super::json::value(&bytes()).is_err())
+    };
+    let path = DAMAGED.into_iter().map(|name| folder.join(name)).find(is_damaged)?;
+    Some(format!(
+        "{}: its cameras are not read: the file is damaged or of another kind",
+        path.display()
+    ))
+}
+
 /// The first file of RealityCapture beside pictures.
 fn reality_capture(folder: &Path, own: &[PathBuf]) -> Option<PathBuf> {
     let is_camera = |path: &&PathBuf| {
@@ -78,11 +101,12 @@ fn reality_capture(folder: &Path, own: &[PathBuf]) -> Option<PathBuf> {
 }
 
 fn pix4d(folder: &Path) -> Option<String> {
-    let (ending, folders) = PIX4D;
+    let (words, folders) = PIX4D;
     let all = folders.into_iter().flat_map(|name| files(&folder.join(name)));
     let mut names =
         all.map(|path| path.file_name().unwrap_or_default().to_string_lossy().into_owned());
-    names.find(|name| name.ends_with(ending)).map(|name| format!("{name} (Pix4D)"))
+    let is_one = |name: &String| words.iter().all(|word| name.contains(word));
+    names.find(is_one).map(|name| format!("{name} (Pix4D)"))
 }
 
 fn replica(folder: &Path) -> Option<String> {

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use subsplat::files::photos::image::{probe, save_depth_png, save_png};
 use subsplat::files::photos::photograph::list_photographs;
 use subsplat::files::poses::cameras_json::is_cameras_json;
-use subsplat::files::poses::find::{folders, is_own_output};
+use subsplat::files::poses::find::folders;
 use subsplat::files::poses::reading::SceneOptions;
 use subsplat::files::poses::scene::{self, load_cameras_with, load_scene_with};
 use subsplat::files::{is_splat_file, load_splat_file};
@@ -115,11 +115,6 @@ pub fn load(file: &Path, strict: bool) -> Result<(Splats, Vec<String>)> {
     }
     content.notes.iter().for_each(print_warning);
     Ok((content.splats, content.comments))
-}
-
-/// Returns whether `path` is a scene file, or a folder that `run` or a training wrote.
-pub fn is_scene(path: &Path) -> bool {
-    is_splat_file(path) || is_own_output(path) || is_training(path)
 }
 
 /// Returns whether a training of 3D Gaussian Splatting wrote the folder `path`.

@@ -12,6 +12,8 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use subsplat::files::is_splat_file;
+use subsplat::files::poses::find::is_own_output;
 use subsplat::finish::PhaseRun;
 use subsplat::scene::navigation::{Start, up_of};
 use subsplat::scene::render::{camera_of_comments, origin_of_comments};
@@ -67,15 +69,20 @@ struct Unrefined {
 /// Loads or reconstructs the scene of the arguments.
 pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     match args.input.as_slice() {
-        [one] if render::is_scene(one) => finished(args, &render::scene_file(one)?, progress),
+        [one] if is_scene(one) => finished(args, &render::scene_file(one)?, progress),
         _ => photographs(args, progress),
     }
+}
+
+/// Returns whether `path` is a scene file, or a folder that `run` or a training wrote.
+fn is_scene(path: &Path) -> bool {
+    is_splat_file(path) || is_own_output(path) || render::is_training(path)
 }
 
 /// Rejects flags for photographs where the scene is finished.
 pub fn check(args: &ViewArgs) -> Result<()> {
     if let ([one], Some(flag)) = (args.input.as_slice(), args.photograph_flag())
-        && render::is_scene(one)
+        && is_scene(one)
     {
         bail!("{flag}: only with photographs; {} is a finished scene", one.display());
     }
