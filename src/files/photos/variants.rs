@@ -364,6 +364,8 @@ mod tests {
             let (x, y) = (i % 24, i / 24);
             let of = |n: usize| ((x * (own + n) + y * (2 * own + n) + x * y * own) % 200) as u8;
             match () {
+                // Files of equal bytes are copies.
+                () if i == 0 => [name.len() as u8; 3],
                 () if is("mask") => [u8::from(x > 9) * 255; 3],
                 () if is("normal") => [120, 130, 230],
                 () if is("seg") => [[200, 10, 40], [10, 200, 90]][x % 2],
