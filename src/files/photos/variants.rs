@@ -339,6 +339,9 @@ mod tests {
     use crate::files::photos::exif::ExifCamera;
     use crate::files::photos::image::save_png;
 
+    /// Names, and those that are left out with the reason.
+    type Case<'a> = (&'a [&'a str], &'a [(&'a str, &'a str)]);
+
     fn found(path: &Path, shot: Option<Shot>) -> Found {
         let header = PhotographHeader {
             width: 6,
@@ -390,7 +393,7 @@ mod tests {
 
     #[test]
     fn masks_maps_and_edited_versions_are_told_by_their_names() {
-        let cases: &[(&[&str], &[(&str, &str)])] = &[
+        let cases: &[Case<'_>] = &[
             (
                 &["a.jpg", "a_mask.png", "A-Depth.png", "b.jpg", "b.normals.jpg"],
                 &[("a_mask.png", IS_MASK), ("A-Depth.png", IS_MAP), ("b.normals.jpg", IS_MAP)],
