@@ -356,11 +356,13 @@ mod tests {
     }
 
     /// A picture whose content its name tells: a mask of two values, normals, labels, a grey map, else a photograph
-    /// with colours; of each first letter another one, edited ones a little brighter.
+    /// with colours; of each first letter another one, edited ones a little
+    /// brighter; `d-edit` is another photograph than `d`.
     fn picture(name: &str) -> Rgb {
         let name = name.to_lowercase();
         let own = name.trim_start_matches("rgb_").bytes().find(u8::is_ascii_alphanumeric);
-        let own = usize::from(own.unwrap_or(0)) + 60 * usize::from(name.contains("photo"));
+        let own = usize::from(own.unwrap_or(0))
+            + 60 * usize::from(name.contains("photo") || name.starts_with("d-"));
         let is = |word: &str| name.contains(word) && !name.contains("photo");
         let light = if is("edited") || name.starts_with("img_e") { 25 } else { 0 };
         let value = |i: usize| {
@@ -408,14 +410,7 @@ mod tests {
             (&["a.jpg", "a_mask photo.jpg", "mask photo_a.jpg", "b.jpg", "b_depth_photo.jpg"], &[]),
             // Another photograph under the name of an edited version.
             (
-                &[
-                    "img_12.jpg",
-                    "c.jpg",
-                    "c-edited.jpg",
-                    "img_e12.jpg",
-                    "d photo-edit.jpg",
-                    "d.jpg",
-                ],
+                &["img_12.jpg", "c.jpg", "c-edited.jpg", "img_e12.jpg", "d-edit.jpg", "d.jpg"],
                 &[("c-edited.jpg", IS_EDITED), ("img_e12.jpg", IS_EDITED)],
             ),
             // Labels.
