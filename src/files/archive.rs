@@ -8,7 +8,7 @@ use zip::{CompressionMethod, ZipArchive};
 /// Reads the entry `name`, at most `limit` bytes.
 ///
 /// # Errors
-/// What is expected and what is found: no such entry, one that is encrypted, too large, cut short or changed.
+/// The expected and the found: no such entry, one that is encrypted, too large, cut short or changed.
 pub(super) fn entry(
     archive: &mut ZipArchive<Cursor<&[u8]>>,
     name: &str,

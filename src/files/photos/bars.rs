@@ -55,7 +55,7 @@ pub(super) fn bars(picture: &Rgb) -> Bars {
     let pixel = |x: usize, y: usize| &data[3 * (y * width + x)..][..3];
     let row = |y: usize| Line::of((0..width).map(|x| pixel(x, y)));
     let [top, bottom] = ends(height, row);
-    // What is above and below belongs to no column.
+    // Columns are judged between the bars above and below.
     let column = |x: usize| Line::of((top..height - bottom).map(|y| pixel(x, y)));
     let [left, right] = ends(width, column);
     Bars { top, bottom, left, right }

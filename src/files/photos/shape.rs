@@ -68,7 +68,8 @@ fn difference(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f64>() / a.len() as f64
 }
 
-fn correlation(a: &[f64], b: &[f64]) -> f64 {
+/// Correlation of values without their means, −1 to 1.
+pub(super) fn correlation(a: &[f64], b: &[f64]) -> f64 {
     let product: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / a.len() as f64;
     product / (deviation(a) * deviation(b)).max(1e-9)
 }

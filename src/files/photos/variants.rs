@@ -5,6 +5,7 @@
 use super::exif::Shot;
 use super::photograph::PhotographHeader;
 use super::raw;
+use super::shape::correlation;
 use crate::files::lower_extension;
 use crate::files::photos::image::load;
 use crate::scene::pictures::Rgb;
@@ -195,9 +196,11 @@ fn has_two_values(picture: &Rgb) -> bool {
 
 fn has_few_colours(picture: &Rgb) -> bool {
     let mut colours = HashSet::new();
-    !is_grey(picture)
-        && picture.data.chunks_exact(3).all(|p| colours.insert(p) || colours.len() <= LABELS_MAX)
-        && colours.len() <= LABELS_MAX
+    let within = |pixel| {
+        colours.insert(pixel);
+        colours.len() <= LABELS_MAX
+    };
+    !is_grey(picture) && picture.data.chunks_exact(3).all(within)
 }
 
 fn has_normals(picture: &Rgb) -> bool {
@@ -234,11 +237,6 @@ fn small(picture: &Rgb) -> Vec<f64> {
     let values: Vec<f64> = (0..SMALL * SMALL).map(block).collect();
     let mean = values.iter().sum::<f64>() / values.len() as f64;
     values.into_iter().map(|v| v - mean).collect()
-}
-
-fn correlation(a: &[f64], b: &[f64]) -> f64 {
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    product(a, b) / (product(a, a) * product(b, b)).sqrt().max(1e-9)
 }
 
 /// The mask of a photograph in its own folder: `a_mask.png` or `mask_a.png` of `a.jpg`, `a_mask.png` of `a_rgb.png`.
@@ -356,8 +354,8 @@ mod tests {
     }
 
     /// A picture whose content its name tells: a mask of two values, normals, labels, a grey map, else a photograph
-    /// with colours; of each first letter another one, edited ones a little
-    /// brighter; `d-edit` is another photograph than `d`.
+    /// with colours; of each first letter another one, edited ones a little brighter; `d-edit` is another photograph
+    /// than `d`.
     fn picture(name: &str) -> Rgb {
         let name = name.to_lowercase();
         let own = name.trim_start_matches("rgb_").bytes().find(u8::is_ascii_alphanumeric);
@@ -381,7 +379,7 @@ mod tests {
         Rgb { width: 24, height: 18, data: (0..24 * 18).flat_map(value).collect() }
     }
 
-    /// What is left out of files of these names.
+    /// Those of files of these names that are left out.
     fn left_out(names: &[&str]) -> Vec<[String; 2]> {
         let folder = tempfile::tempdir().unwrap();
         let files = names.iter().map(|name| {
