@@ -47,19 +47,27 @@ pub(crate) fn hidden(shares: &[f32], photographs: usize, least_share: f32) -> Ve
     shares.iter().map(|share| enough && *share < least_share).collect()
 }
 
-/// Parents that are not [`hidden`], marked by true; `None` where all stay.
+/// Parents that are not [`hidden`], marked by true, at most `most`: those with the largest shares, of equal ones the
+/// first. `None` where all stay.
 pub(crate) fn shown(
     splats: &Splats,
     views: &[MaskedView<'_>],
     raster: &RasterOptions,
-    least_share: f32,
+    (least_share, most): (f32, usize),
     renderer: &mut Renderer,
 ) -> Option<Vec<bool>> {
     if views.len() < PHOTOGRAPHS_TO_REMOVE || !(least_share > 0.0) {
         return None;
     }
-    let hidden = hidden(&shares(splats, views, raster, renderer), views.len(), least_share);
-    hidden.contains(&true).then(|| hidden.into_iter().map(|hidden| !hidden).collect())
+    let shares = shares(splats, views, raster, renderer);
+    let mut shown: Vec<bool> =
+        hidden(&shares, views.len(), least_share).into_iter().map(|hidden| !hidden).collect();
+    let mut order: Vec<usize> = (0..shown.len()).filter(|i| shown[*i]).collect();
+    if order.len() > most {
+        order.sort_by(|a, b| shares[*b].total_cmp(&shares[*a]));
+        order.iter().skip(most).for_each(|i| shown[*i] = false);
+    }
+    shown.contains(&false).then_some(shown)
 }
 
 /// The Gaussians without the parents that are [`hidden`]; `None` where all stay.
@@ -74,7 +82,7 @@ pub(super) fn pruned(
     if !groups.equal_families {
         return None;
     }
-    let keep = shown(splats, views, raster, least_share, renderer)?;
+    let keep = shown(splats, views, raster, (least_share, usize::MAX), renderer)?;
     let children = splats.children_per_parent();
     let mut end = 0;
     let ranges: Vec<Range<usize>> = groups
@@ -182,7 +190,7 @@ mod tests {
         assert!(mean > 0.7 && (seen - 2.0 * mean).abs() < 1e-3, "{seen} {mean}");
         assert_eq!(beside, 0.0);
         let keep = |views: usize, least: f32, renderer: &mut Renderer| {
-            shown(&both, &vec![view; views], &raster, least, renderer)
+            shown(&both, &vec![view; views], &raster, (least, usize::MAX), renderer)
         };
         assert_eq!(keep(3, 0.3, &mut renderer), Some(vec![true, false]));
         assert_eq!(keep(2, 0.3, &mut renderer), None);

@@ -102,21 +102,34 @@ pub fn match_parents(
     Ok(found.into_iter().map(|one| one.factor).collect())
 }
 
-/// Options of the optimisation of parents in a scene that is refined by `scene`; `None` where the scene is
-/// not refined, or where the pictures have the input's size.
-pub fn options_of_parents(scene: &RefineOptions, inputs: &[Cropped]) -> Option<RefineOptions> {
+/// Options of the optimisation of parents.
+#[derive(Clone, Copy, Debug)]
+pub struct ParentsOptions {
+    /// Steps and rates.
+    pub refine: RefineOptions,
+    /// Most parents that are optimised, those with the largest shares of the photographs.
+    pub most: usize,
+}
+
+/// Options of the optimisation of parents in a scene that is refined by `scene` and has at most `most`
+/// Gaussians; `None` where the scene is not refined, or where the pictures have the input's size.
+pub fn options_of_parents(
+    scene: &RefineOptions,
+    inputs: &[Cropped],
+    most: usize,
+) -> Option<ParentsOptions> {
     let larger = inputs.iter().any(|c| c.target.width > c.input.width);
     let time = scene.time.map(|time| time.mul_f32(TIME_SHARE));
     // Parents are the children's anchors: none is removed before there are children. Children have the SH sets of
     // the network.
     let steps = scene.steps.saturating_mul(STEPS).min(STEPS_MAX);
-    let options = RefineOptions { steps, time, least_share: 0.0, sh_rate: 0.0, ..*scene };
-    (scene.steps > 0 && larger).then_some(options)
+    let refine = RefineOptions { steps, time, least_share: 0.0, sh_rate: 0.0, ..*scene };
+    (scene.steps > 0 && larger).then_some(ParentsOptions { refine, most })
 }
 
 /// Fits and refines `parents` on the photographs of the input's size, which `raster` renders, by
-/// [`options_of_parents`]. Those that the photographs hardly show, and those of masked pixels, become transparent
-/// instead, and get no children. `progress` receives the refinement after each step, and `None` after each step of
+/// [`options_of_parents`]. Those that the photographs hardly show, those above [`ParentsOptions::most`] and those of
+/// masked pixels become transparent instead, and get no children. `progress` receives the refinement after each step, and `None` after each step of
 /// the fit.
 ///
 /// # Errors
@@ -125,18 +138,18 @@ pub fn refine_parents(
     parents: &mut Splats,
     inputs: &[Cropped],
     raster: &RasterOptions,
-    options: &RefineOptions,
+    options: &ParentsOptions,
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(Option<&PhaseRun<'_>>) -> ControlFlow<()>,
 ) -> Result<()> {
     let views = finishing::input_views(inputs);
     let per_view = parents.len() / inputs.len().max(1);
     let Some(unmasked) = finishing::kept_parents(inputs, per_view) else {
-        let groups = Groups::equal(parents, views.len(), options.grouped);
+        let groups = Groups::equal(parents, views.len(), options.refine.grouped);
         return refine_shown(parents, groups, &views, raster, options, renderer, progress);
     };
     let mut own = families(parents, &unmasked);
-    let groups = match options.grouped {
+    let groups = match options.refine.grouped {
         true => finishing::groups_of(&unmasked, per_view, 1),
         false => Groups::default(),
     };
@@ -152,14 +165,14 @@ fn refine_shown(
     mut groups: Groups,
     views: &[MaskedView<'_>],
     raster: &RasterOptions,
-    options: &RefineOptions,
+    options: &ParentsOptions,
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(Option<&PhaseRun<'_>>) -> ControlFlow<()>,
 ) -> Result<()> {
-    let keep = shown(parents, views, raster, PARENTS_SHARE, renderer);
+    let keep = shown(parents, views, raster, (PARENTS_SHARE, options.most), renderer);
     let mut kept = keep.as_ref().map(|keep| families(parents, keep));
     if let Some(kept) = &kept {
-        groups = Groups::equal(kept, views.len(), options.grouped);
+        groups = Groups::equal(kept, views.len(), options.refine.grouped);
     }
     let moved = kept.as_mut().unwrap_or(parents);
     // Without this fit, three photographs of `../shared/photos` have 18.93 dB / .683 instead of 18.92 / .685 (128 → 256),
@@ -168,7 +181,7 @@ fn refine_shown(
     let sizes = FitOptions::default();
     fit_masked(moved, views, raster, &sizes, renderer, &mut step).map_err(finishing::error)?;
     let mut step = |phase: &PhaseRun<'_>| progress(Some(phase));
-    refine_groups(moved, &mut groups, views, raster, options, renderer, &mut step)
+    refine_groups(moved, &mut groups, views, raster, &options.refine, renderer, &mut step)
         .map_err(finishing::error)?;
     if let (Some(keep), Some(kept)) = (keep, kept) {
         restore(parents, &keep, &kept);

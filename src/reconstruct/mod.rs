@@ -97,7 +97,9 @@ pub(crate) use surroundings::{add_surroundings, restore_surroundings, take_surro
 /// The stages of a run, one by one, for evaluation. No version promises anything about them.
 pub mod stages {
     pub use super::children::{Counts, SceneChildren, counts_of};
-    pub use super::coarse_to_fine::{match_parents, options_of_parents, refine_parents};
+    pub use super::coarse_to_fine::{
+        ParentsOptions, match_parents, options_of_parents, refine_parents,
+    };
     pub use super::detail::add_detail;
     pub use super::equal_exposure::equalise;
     pub use super::finishing::{fit_to_inputs, refine_on_inputs};

@@ -130,7 +130,9 @@ impl Prepared<'_> {
         let mut renderer = Renderer::new(model.backend());
         let density = options.density;
         let scene_options = options.parents_options(inputs.len());
-        let parents_options = options_of_parents(&scene_options, &inputs);
+        let count = encoding.per_view() * inputs.len();
+        let most = density.limit(count, inputs.len(), config.upscale);
+        let parents_options = options_of_parents(&scene_options, &inputs, most);
         let ended = Cell::new(false);
         let mut factors = Vec::new();
         let mut parents = None;
@@ -184,7 +186,7 @@ impl Prepared<'_> {
         let fit_options = &options.fit_options(inputs.len());
         let mut refine_options = options.refine_options(inputs.len());
         if let (Some(time), Some(used)) =
-            (refine_options.time, parents_options.and_then(|options| options.time))
+            (refine_options.time, parents_options.and_then(|options| options.refine.time))
         {
             refine_options.time = Some(time.saturating_sub(used));
         }

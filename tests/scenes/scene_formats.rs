@@ -4,6 +4,7 @@ use subsplat_test_support::colmap_files;
 use subsplat_test_support::made_up;
 use subsplat_test_support::noise;
 
+use crate::as_people_have_them::write_transforms;
 use glam::{Mat4, Vec3};
 use made_up::made_up;
 use noise::noise;
@@ -187,6 +188,30 @@ fn colmap_points_give_the_depth_range() {
     assert_eq!(DepthBounds::of_scene(&scene, &[0]).unwrap(), None);
     let error = of_frames(&scene, 0, DepthRange::Auto).unwrap_err().to_string();
     assert!(error.contains(&scene.name) && error.contains("distance of 0"), "{error}");
+}
+
+#[test]
+fn the_content_of_a_file_decides_and_not_its_name() {
+    let (folder, cameras) = made_up(4);
+    let [own, nerfs] = ["cameras.json", "transforms.json"].map(|name| folder.path().join(name));
+    let content = CameraFile { cameras: cameras.clone(), ..Default::default() };
+    save_cameras_json(&own, &content).unwrap();
+    std::fs::rename(&own, &nerfs).unwrap();
+    for given in [folder.path(), &nerfs] {
+        let scene = load_scene(given).unwrap();
+        let poses = scene.frames.iter().map(|f| f.camera.world_from_camera());
+        assert!(poses.eq(cameras.iter().map(|c| c.camera.world_from_camera())));
+    }
+    std::fs::remove_file(&nerfs).unwrap();
+    write_transforms(&own, &cameras, str::to_owned);
+    assert_eq!(load_scene(&own).unwrap().frames.len(), 4);
+    // Neither layout: the name decides which one is expected.
+    for (path, expected) in [(&own, "c2w"), (&nerfs, "transform_matrix")] {
+        std::fs::write(path, r#"{"frames": [{"a": 1}]}"#).unwrap();
+        let error = load_scene(path).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+        std::fs::remove_file(path).unwrap();
+    }
 }
 
 #[test]

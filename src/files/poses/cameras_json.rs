@@ -172,23 +172,32 @@ pub(super) fn matrix(rows: &[Vec<f64>]) -> std::result::Result<DMat4, String> {
     Ok(DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose())
 }
 
-/// Reports whether a pose file has this layout: `cameras.json` by its name, and any other
-/// JSON file but `transforms.json` that begins with a camera of this layout.
+/// Reports whether a pose file has this layout: a JSON file whose frames have `c2w`, or a list of cameras. The
+/// content decides. The name does where the content has no frames of this layout or of `transforms.json`.
 ///
 /// # Errors
-/// A file of another name that is not JSON.
+/// A file of another name than these two that is not JSON.
 pub fn is_cameras_json(path: impl AsRef<Path>) -> Result<bool> {
     has_this_layout(path.as_ref())
 }
 
 fn has_this_layout(path: &Path) -> Result<bool> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-    if ["cameras.json", "transforms.json"].contains(&&*name) || !name.ends_with(".json") {
-        return Ok(name == "cameras.json");
+    if !name.ends_with(".json") {
+        return Ok(false);
     }
-    let value =
-        json::value(&read(path)?).map_err(|e| json::error(path, "a JSON file with cameras", &e))?;
-    Ok(value.is_array() || value["frames"][0].get("c2w").is_some())
+    let by_name = name == "cameras.json";
+    let value = match json::value(&read(path)?) {
+        Ok(value) => value,
+        // Its reader names the place of the error.
+        Err(_) if by_name || name == "transforms.json" => return Ok(by_name),
+        Err(e) => return Err(json::error(path, "a JSON file with cameras", &e)),
+    };
+    let has = |key: &str| {
+        let frames = value.get("frames").and_then(serde_json::Value::as_array);
+        frames.is_some_and(|frames| frames.iter().any(|frame| frame.get(key).is_some()))
+    };
+    Ok(value.is_array() || has("c2w") || (by_name && !has("transform_matrix")))
 }
 
 fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {

@@ -14,8 +14,8 @@ use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::inputs::crop::{Cropped, PhotoWindow};
 use subsplat::reconstruct::stages::{
-    SceneChildren, add_surroundings, counts_of, fit_to_inputs, match_parents, options_of_parents,
-    refine_on_inputs, refine_parents,
+    ParentsOptions, SceneChildren, add_surroundings, counts_of, fit_to_inputs, match_parents,
+    options_of_parents, refine_on_inputs, refine_parents,
 };
 use subsplat::reconstruct::{
     Density, DepthBounds, DepthRange, Error, Reconstructor, Refine, Result,
@@ -357,7 +357,8 @@ impl<'a> PictureMaker<'a> {
         let mut part = |_: f32| ControlFlow::Continue(());
         let mut go_on = |_: Option<&PhaseRun<'_>>| ControlFlow::Continue(());
         match_parents(&mut parents, inputs, self.bounds.near_far(), &mut part)?;
-        let options = self.refine.options_for(inputs.len(), true);
+        let refine = self.refine.options_for(inputs.len(), true);
+        let options = ParentsOptions { refine, most: usize::MAX };
         let renderer = &mut Renderer::default();
         refine_parents(&mut parents, inputs, &small, &options, renderer, &mut go_on)?;
         Ok(parents)
@@ -382,8 +383,10 @@ impl<'a> PictureMaker<'a> {
             match_parents(&mut own, inputs, near_far, &mut part)?;
         }
         let options = self.refine.options_for(inputs.len(), true);
+        let count = encoding.per_view() * inputs.len();
+        let most = self.density.limit(count, inputs.len(), model.config().upscale);
         let options =
-            options_of_parents(&options, inputs).filter(|_| parents != Parents::Predicted);
+            options_of_parents(&options, inputs, most).filter(|_| parents != Parents::Predicted);
         if let Some(options) = options {
             refine_parents(&mut own, inputs, &small, &options, &mut renderer, &mut go_on)?;
         }
