@@ -6,7 +6,9 @@ use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use rayon::prelude::*;
 use std::ops::Range;
-use subsplat_kernels::layout::{Gradients, RasterOptions, SplatSlices, gain_with_offsets};
+use subsplat_kernels::layout::{
+    Gradients, OPACITY_OFFSET, RasterOptions, SPLAT_STRIDE, SplatSlices, gain_with_offsets,
+};
 
 /// Fewest parents of a parallel task.
 const TASK: usize = 4096;
@@ -98,10 +100,34 @@ pub(super) fn pruned(
     (end > 0).then(|| (families(splats, &keep), Groups { ranges, equal_families: true }))
 }
 
+/// Share of each parent in the photographs: those of [`shares_of_visible`], without the transparent parents, which
+/// have none.
+pub(crate) fn shares(
+    splats: &Splats,
+    views: &[MaskedView<'_>],
+    raster: &RasterOptions,
+    renderer: &mut Renderer,
+) -> Vec<f32> {
+    let families_of = splats.rows.chunks_exact(splats.children_per_parent() * SPLAT_STRIDE);
+    let seen =
+        |family: &[f32]| family.chunks_exact(SPLAT_STRIDE).any(|row| row[OPACITY_OFFSET] > 0.0);
+    let visible: Vec<bool> = families_of.map(seen).collect();
+    let number = visible.iter().filter(|visible| **visible).count();
+    if number == visible.len() {
+        return shares_of_visible(splats, views, raster, renderer);
+    }
+    // An average parent is one of all.
+    let factor = visible.len() as f32 / number.max(1) as f32;
+    let shares = shares_of_visible(&families(splats, &visible), views, raster, renderer);
+    let mut shares = shares.into_iter();
+    let share = |visible: bool| if visible { factor * shares.next().unwrap_or(0.0) } else { 0.0 };
+    visible.into_iter().map(share).collect()
+}
+
 /// Share of each parent in the photographs: the weights T·α of its children, summed over all
 /// pixels that are not masked, over those of an average parent. The sums are gradients by the colour offsets of a
 /// loss that adds all pixels.
-pub(crate) fn shares(
+fn shares_of_visible(
     splats: &Splats,
     views: &[MaskedView<'_>],
     raster: &RasterOptions,
@@ -201,6 +227,27 @@ mod tests {
         let half = MaskedView { mask: Some(&mask), ..view };
         let masked = shares(&both, &[half], &raster, &mut renderer)[0];
         assert!((masked - seen).abs() < 0.01 * seen, "{masked} {seen}");
+    }
+
+    /// What is transparent has no share and changes none; of more parents than may stay, those with the largest
+    /// shares do.
+    #[test]
+    fn transparent_parents_have_no_share_and_the_largest_stay() {
+        let (camera, image) = (camera(), Rgb { width: 32, height: 32, data: vec![0; 3 * 32 * 32] });
+        let view = MaskedView { camera: &camera, image: &image, mask: None };
+        let (mut renderer, raster) = (Renderer::default(), RasterOptions::default());
+        let mut all = splats(&[[0.5, 0.2], [0.0, 4.0], [-0.5, 0.4], [0.2, 0.3]]);
+        all.rows[SPLAT_STRIDE + OPACITY_OFFSET] = 0.0;
+        let drawn = shares_of_visible(&all, &[view; 3], &raster, &mut renderer);
+        let found = shares(&all, &[view; 3], &raster, &mut renderer);
+        assert_eq!((found[1], drawn[1]), (0.0, 0.0));
+        let near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-5 * b.max(1e-3);
+        assert!(found.iter().zip(&drawn).all(near), "{found:?} {drawn:?}");
+        assert!(found[2] > found[3] && found[3] > found[0] && found[0] > 0.02, "{found:?}");
+        let mut keep = |most| shown(&all, &[view; 3], &raster, (0.02, most), &mut renderer);
+        assert_eq!(keep(3), Some(vec![true, false, true, true]));
+        assert_eq!(keep(2), Some(vec![false, false, true, true]));
+        assert_eq!(keep(1), Some(vec![false, false, true, false]));
     }
 
     #[test]

@@ -66,13 +66,14 @@ fn grids_of(network: &SubSplat) -> Vec<usize> {
 
 /// Numbers of children of the parents for `density`; `None` where all have r² children. `raster` renders
 /// pictures of the input's size, from which the parents' shares come. Parents of masked pixels have no children, and
-/// `density` counts the others alone.
+/// `density` counts the others alone. `parents` are those of `encoding` where the caller has them.
 ///
 /// # Errors
 /// Those of the network; a number of [`Density::Each`] that is not in 1 to 64.
 pub fn counts_of(
     network: &SubSplat,
     encoding: &SceneEncoding,
+    parents: Option<Splats>,
     inputs: &[Cropped],
     density: Density,
     raster: &RasterOptions,
@@ -88,7 +89,10 @@ pub fn counts_of(
     if density.is_full(number, inputs.len(), upscale) {
         return Ok(kept.map(Counts::Kept));
     }
-    let parents = encoding.parents(network)?;
+    let parents = match parents {
+        Some(parents) => parents,
+        None => encoding.parents(network)?,
+    };
     let photographs = input_views(inputs);
     let mut shares = match &kept {
         Some(kept) => shares_of_kept(&parents, kept, &photographs, raster, renderer),
@@ -195,14 +199,14 @@ impl SceneChildren {
         Self { splats, groups, origins: Origins::Mixed { parents, counts }, ..self }
     }
 
-    /// Adds the colour offsets of `parents` to those of their children. Parents without offsets change
-    /// nothing.
-    pub fn add_offsets(&mut self, parents: &Splats) {
-        let (offsets, rest) = parents.gain.as_chunks::<GAIN_WITH_OFFSETS>();
-        if offsets.len() != parents.len() || !rest.is_empty() || self.splats.is_empty() {
+    /// Adds the colour offsets of the parents to those of their children. `gains` are those of `parents` parents;
+    /// gains without offsets change nothing.
+    pub fn add_offsets(&mut self, gains: &[f32], parents: usize) {
+        let (offsets, rest) = gains.as_chunks::<GAIN_WITH_OFFSETS>();
+        if offsets.len() != parents || !rest.is_empty() || self.splats.is_empty() {
             return;
         }
-        let children = (self.splats.len() / parents.len().max(1)).max(1);
+        let children = (self.splats.len() / parents.max(1)).max(1);
         let of_child = |i: usize| {
             let parent = match &self.origins {
                 Origins::Regular => i / children,

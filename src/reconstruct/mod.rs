@@ -59,6 +59,7 @@ mod progress;
 mod projections;
 mod reconstruction;
 mod reconstructor;
+mod repeated;
 mod surroundings;
 mod unit;
 mod verdict;

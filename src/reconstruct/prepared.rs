@@ -1,6 +1,7 @@
 //! Photographs that are cropped and checked, and the network's run on them.
 
 use super::progress::Tracker;
+use super::repeated::{self, hide_repeated};
 use super::unit;
 use super::{
     DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, SceneChildren,
@@ -135,7 +136,7 @@ impl Prepared<'_> {
         let parents_options = options_of_parents(&scene_options, &inputs, most);
         let ended = Cell::new(false);
         let mut factors = Vec::new();
-        let mut parents = None;
+        let (mut parents, mut gains) = (None, Vec::new());
         if options.matches_depth() || parents_options.is_some() {
             let mut own = encoding.parents(network)?;
             if options.matches_depth() {
@@ -143,6 +144,9 @@ impl Prepared<'_> {
                 let mut part = tracker.parts(progress);
                 factors = match_parents(&mut own, &inputs, bounds.near_far(), &mut part)?;
             }
+            // A scene that may have all children keeps all parents.
+            let most = repeated::MOST.max(most / config.upscale.pow(2));
+            hide_repeated(&mut own, &inputs, most);
             if let Some(options) = &parents_options {
                 tracker.begin(Stage::Parents, progress)?;
                 let mut part = tracker.parts(progress);
@@ -156,19 +160,19 @@ impl Prepared<'_> {
                 refine_parents(&mut own, &inputs, raster, options, renderer, &mut step)?;
             }
             encoding = encoding.with_parents(network, &own)?;
+            gains = std::mem::take(&mut own.gain);
             parents = Some(own);
         }
         tracker.begin(Stage::Subsplat, progress)?;
-        let counts =
-            counts_of(network, &encoding, &inputs, density, &raster_at(1.0), &mut renderer)?;
+        let (raster, of_counts) = (&raster_at(1.0), &mut renderer);
+        let counts = counts_of(network, &encoding, parents, &inputs, density, raster, of_counts)?;
         let steps = encoding.steps(network.trunk());
         let mut children = tracker.run_steps(steps, progress, |step| {
             SceneChildren::new(network, &encoding, inputs.len(), counts, step)
         })?;
         drop((views, encoding));
-        if let Some(parents) = parents {
-            children.add_offsets(&parents);
-        }
+        children.add_offsets(&gains, count);
+        drop(gains);
         for (distances, factors) in children.distances.iter_mut().zip(&factors) {
             distances.iter_mut().zip(factors).for_each(|(distance, factor)| *distance *= factor);
         }

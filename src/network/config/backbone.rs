@@ -150,6 +150,12 @@ pub enum FeatureLevel {
     Refine1,
 }
 
+impl FeatureLevel {
+    /// All levels.
+    pub const ALL: [Self; 6] =
+        [Self::Trans4, Self::Trans8, Self::Trans16, Self::Cnn4, Self::Cnn2, Self::Refine1];
+}
+
 impl Primaries {
     pub(super) fn with(sh_frame: ShFrame) -> Self {
         Self { sh_degree: 4, scale_min: 0.5, scale_max: 15.0, opacity_exponent: 0.0, sh_frame }

@@ -170,19 +170,23 @@ impl Views {
     }
 }
 
+/// Feature maps that a caller of a backbone reads. Maps of the photographs' size are large: 32 channels of fifty
+/// views of 192×352 px take 430 MB, and as much again while they are joined.
+pub type Levels<'a> = &'a dyn Fn(FeatureLevel) -> bool;
+
 /// Output of a backbone. The H·W pixels are in row-major order, with G Gaussians each.
 #[derive(Clone, Debug)]
 pub struct BackboneOutput<A = Tensor> {
     /// `[B, V, H·W, 2 + 3 + 4 + 3·D]`, the raw head of MVSplat's adapter: sub-pixel offset
     /// and scale before the sigmoid; quaternion xyzw, camera frame, not unit; SH,
-    /// colour-major, before the degree mask.
+    /// colour-major, before the degree mask. Only the primaries are made from it.
     pub raw: A,
     /// `[B, V, H·W, G]`: distance along the unit ray, world units.
     pub depths: A,
     /// `[B, V, H·W, G]`: opacity in (0, 1) before the opacity mapping and the
     /// division by G.
     pub densities: A,
-    /// `[B, V, C_ℓ, h_ℓ, w_ℓ]` of every level.
+    /// `[B, V, C_ℓ, h_ℓ, w_ℓ]` of the levels that were asked for.
     pub features: Vec<(FeatureLevel, A)>,
 }
 

@@ -20,7 +20,7 @@ use super::trunk::{MixedChildren, Trunk};
 use super::{BackboneOutput, Primaries, Views};
 use crate::network::ops::{Array, TapeArray};
 use crate::scene::splats::Splats;
-use candle_core::{Device, Result, Tensor, bail};
+use candle_core::{DType, Device, Result, Tensor, bail};
 use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{RasterOptions, SPLAT_STRIDE};
 
@@ -71,10 +71,11 @@ impl SubSplat {
         }
         if let Some(result) = self.trunk().on_device(|executor| {
             let images = executor.upload(&views.images)?;
-            let output = self.encode_on(views, &images, &mut Trace::with_checkpoint(checkpoint))?;
-            // Inference needs no tape, and the trunk not all maps.
-            let mut output = output.map(|array| Ok(array.detach()))?;
-            output.features.retain(|(level, _)| self.trunk().reads(*level));
+            let mut trace = Trace::with_checkpoint(checkpoint);
+            let levels = |level| self.trunk().reads(level);
+            let output = self.encode_on(views, &images, &levels, &mut trace)?;
+            // Inference needs no tape.
+            let output = output.map(|array| Ok(array.detach()))?;
             if waits {
                 executor.finish()?;
             }
@@ -90,7 +91,8 @@ impl SubSplat {
     /// Runs the backbone on the CPU.
     fn host_features(&self, views: &Views, checkpoint: Checkpoint<'_>) -> Result<SceneFeatures> {
         let mut trace = Trace::with_checkpoint(checkpoint);
-        let output = self.encode_on(views, &views.images, &mut trace)?;
+        let levels = |level| self.trunk().reads(level);
+        let output = self.encode_on(views, &views.images, &levels, &mut trace)?;
         Ok(SceneFeatures { views: views.clone(), output: Output::Host(output) })
     }
 
@@ -118,6 +120,9 @@ impl SubSplat {
             }
         };
         let parents = primaries(&output, &views, settings, &mut Trace::off())?;
+        // The primaries have all of it: 22 numbers of each pixel.
+        let raw = Tensor::zeros(0, DType::F32, &Device::Cpu)?;
+        let output = BackboneOutput { raw, ..output };
         Ok(SceneEncoding::new(views, output, parents))
     }
 

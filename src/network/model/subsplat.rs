@@ -8,7 +8,7 @@ use super::taped::Tape;
 use super::taped::Taped;
 use super::trace::{Checkpoint, Trace};
 use super::trunk::{Children, Trunk};
-use super::{BackboneOutput, Primaries, Views};
+use super::{BackboneOutput, Levels, Primaries, Views};
 use crate::network::config::{Backbone, Config, FeatureLevel};
 use crate::network::ops::small::SmallArray;
 use crate::network::ops::{Array, Backend};
@@ -112,11 +112,12 @@ impl SubSplat {
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
             let mut trace = Trace::with_checkpoint(checkpoint);
-            self.encode_on(views, &images, &mut trace)?.to_host()
+            self.encode_on(views, &images, &|_| true, &mut trace)?.to_host()
         }) {
             return result;
         }
-        self.encode_on(views, &views.images, &mut Trace::with_checkpoint(checkpoint))
+        let mut trace = Trace::with_checkpoint(checkpoint);
+        self.encode_on(views, &views.images, &|_| true, &mut trace)
     }
 
     /// Refuses images whose sides are no multiples of [`Config::stride`].
@@ -129,17 +130,23 @@ impl SubSplat {
         Ok(())
     }
 
-    /// Runs the backbone on the executor of `images`, the views' images.
+    /// Runs the backbone on the executor of `images`, the views' images, for the feature maps of `levels`.
     pub(super) fn encode_on<A: SmallArray>(
         &self,
         views: &Views,
         images: &A,
+        levels: Levels<'_>,
         trace: &mut Trace<'_>,
     ) -> Result<BackboneOutput<A>> {
         match &self.encoder {
-            Encoder::Mvsplat(encoder) => encoder.forward_on(views, images, trace),
+            Encoder::Mvsplat(encoder) => {
+                let mut output = encoder.forward_on(views, images, trace)?;
+                output.features.retain(|(level, _)| levels(*level));
+                Ok(output)
+            }
             Encoder::Small(encoder) => {
-                Ok(encoder.forward_on(views, images, DisparityMean::AroundMode, trace)?.0)
+                let mean = DisparityMean::AroundMode;
+                Ok(encoder.forward_on(views, images, mean, levels, trace)?.0)
             }
         }
     }
@@ -242,7 +249,8 @@ impl SubSplat {
                 Ok((encoder.forward_on(views, images, &mut Trace::off())?, None))
             }
             Encoder::Small(encoder) => {
-                let (output, maps) = encoder.forward_on(views, images, mean, &Trace::off())?;
+                let (output, maps) =
+                    encoder.forward_on(views, images, mean, &|_| true, &Trace::off())?;
                 Ok((output, Some(maps)))
             }
         }

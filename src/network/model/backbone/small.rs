@@ -18,7 +18,7 @@ use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mea
 use crate::network::config::{FeatureLevel, Small};
 use crate::network::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, LayerInit, sigmoid};
 use crate::network::model::trace::Trace;
-use crate::network::model::{BackboneOutput, Views};
+use crate::network::model::{BackboneOutput, Levels, Views};
 use crate::network::ops::plane_sweep::{Pair, Sweep, pair, relative_pose};
 use crate::network::ops::small::{Candidates, MeanOver, SmallArray, Start};
 use crate::network::ops::{Array, Backend};
@@ -180,11 +180,11 @@ impl SmallBackbone {
         views: &Views,
         mean: DisparityMean,
     ) -> Result<(BackboneOutput, DepthMaps)> {
-        self.forward_on(views, &views.images, mean, &Trace::off())
+        self.forward_on(views, &views.images, mean, &|_| true, &Trace::off())
     }
 
-    /// [`SmallBackbone::forward`] on the executor of `images`, the views' images, with a checkpoint
-    /// after each part. The trace records nothing.
+    /// [`SmallBackbone::forward`] on the executor of `images`, the views' images, with the feature maps that
+    /// `levels` names and a checkpoint after each part. The trace records nothing.
     ///
     /// # Errors
     /// Those of [`SmallBackbone::forward`] and of the checkpoint.
@@ -193,12 +193,15 @@ impl SmallBackbone {
         views: &Views,
         images: &A,
         mean: DisparityMean,
+        levels: Levels<'_>,
         trace: &Trace<'_>,
     ) -> Result<(BackboneOutput<A>, DepthMaps<A>)> {
         let [b, v, _, h, w] = images.sizes()?;
         let Matched { rgb, feat2, feat4, deep, logits, index, confidence } =
             self.matched(views, images, mean, trace)?;
-        let heads = self.heads(&rgb, &deep, [&index, &confidence], mean, trace)?;
+        let keeps_hidden = levels(FeatureLevel::Refine1);
+        let sides = [&index, &confidence];
+        let heads = self.heads(&rgb, &deep, sides, (mean, keeps_hidden), trace)?;
         let mut depths = self.ray_distance(views, &index)?;
         let mut densities = heads.density.reshape((b, v, h * w, 1))?;
         let enough = v >= CONSENSUS_VIEWS && mean == DisparityMean::AroundMode;
@@ -207,14 +210,21 @@ impl SmallBackbone {
             depths = images.depth_consensus(&views.cameras, &views.near_far, maps)?;
         }
         let pool = |s: usize| -> Result<A> { split_views(&deep.avg_pool2d(s)?, b, v) };
-        let features = vec![
-            (FeatureLevel::Trans4, split_views(&deep, b, v)?),
-            (FeatureLevel::Trans8, pool(2)?),
-            (FeatureLevel::Trans16, pool(4)?),
-            (FeatureLevel::Cnn4, split_views(&feat4, b, v)?),
-            (FeatureLevel::Cnn2, split_views(&feat2, b, v)?),
-            (FeatureLevel::Refine1, split_views(&heads.hidden, b, v)?),
-        ];
+        let mut features = Vec::new();
+        for level in FeatureLevel::ALL.into_iter().filter(|level| levels(*level)) {
+            let map = match level {
+                FeatureLevel::Trans4 => split_views(&deep, b, v)?,
+                FeatureLevel::Trans8 => pool(2)?,
+                FeatureLevel::Trans16 => pool(4)?,
+                FeatureLevel::Cnn4 => split_views(&feat4, b, v)?,
+                FeatureLevel::Cnn2 => split_views(&feat2, b, v)?,
+                FeatureLevel::Refine1 => match &heads.hidden {
+                    Some(hidden) => split_views(hidden, b, v)?,
+                    None => continue,
+                },
+            };
+            features.push((level, map));
+        }
         if self.config.cross_check {
             densities = densities.mul(&images.cross_check(&views.cameras, &depths)?)?;
         }
@@ -411,13 +421,14 @@ impl SmallBackbone {
         logits.expectation(window.max(1), over)
     }
 
-    /// `sides`: candidate index and confidence (a logit), `[B·V, 1, H, W]`.
+    /// `sides`: candidate index and confidence (a logit), `[B·V, 1, H, W]`. The hidden maps are kept where
+    /// `keeps_hidden`.
     fn heads<A: SmallArray>(
         &self,
         rgb: &A,
         deep: &A,
         sides: [&A; 2],
-        mean: DisparityMean,
+        (mean, keeps_hidden): (DisparityMean, bool),
         trace: &Trace<'_>,
     ) -> Result<Heads<A>> {
         let [views, ..] = rgb.sizes::<4>()?;
@@ -442,10 +453,11 @@ impl SmallBackbone {
             let [raw, density] = out.head_output(&confidence, &rgb, self.start())?;
             raws.push(raw);
             densities.push(density);
-            hiddens.push(hidden);
+            hiddens.extend(keeps_hidden.then_some(hidden));
             trace.step()?;
         }
-        Ok(Heads { raw: whole(raws)?, density: whole(densities)?, hidden: whole(hiddens)? })
+        let hidden = if keeps_hidden { Some(whole(hiddens)?) } else { None };
+        Ok(Heads { raw: whole(raws)?, density: whole(densities)?, hidden })
     }
 
     /// Values that the raw head corrects: offset 0, σ of 0.6 px, no rotation, the pixel's
@@ -509,7 +521,7 @@ struct Swept<A> {
 struct Heads<A> {
     raw: A,
     density: A,
-    hidden: A,
+    hidden: Option<A>,
 }
 
 fn conv_norm(c: usize, o: usize, s: ConvShape, vb: VarBuilder) -> Result<(Conv2d, GroupNorm)> {

@@ -392,7 +392,7 @@ impl<'a> PictureMaker<'a> {
         }
         encoding = encoding.with_parents(model, &own)?;
         let mut children = network.children(model, &encoding, inputs, self.density, &small)?;
-        children.add_offsets(&own);
+        children.add_offsets(own.gain(), own.len());
         let at = (model, inputs, ratio);
         let options = self.refine.options_for(inputs.len(), true);
         let steps = if options.needs_fit(inputs.len()) { &IN_ORDER[1..] } else { &IN_ORDER[1..2] };
@@ -513,7 +513,7 @@ impl<'a> Network<'a> {
         raster: &RasterOptions,
     ) -> Result<SceneChildren> {
         let mut renderer = Renderer::default();
-        let counts = counts_of(network, encoding, inputs, density, raster, &mut renderer)?;
+        let counts = counts_of(network, encoding, None, inputs, density, raster, &mut renderer)?;
         Ok(SceneChildren::new(network, encoding, inputs.len(), counts, &|| Ok(()))?)
     }
 
