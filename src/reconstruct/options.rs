@@ -243,27 +243,23 @@ impl Options {
 /// | `High` | up to 512² | [`Density::Auto`] | 8 |
 /// | `Best` | up to 512² | [`Density::Auto`] | 16 |
 ///
-/// PSNR in dB / SSIM of new views, PSNR at the inputs' own cameras, CPU-seconds and memory, one run each
-/// on a busy EPYC with AVX-512. The first two pairs chose the table; the last two columns did not. A
-/// level was measured by the single flags that it stands for. Pairs of
-/// `../shared/photos/fox`: `subsplat run fox --context 17,19 --target 18 --size 576x1024 --upscale 2
-/// --quality LEVEL`, then 3,7 with 5, then 10,16 with 12,13,14; they overlap by 96, 90 and 75 %.
-/// `examples/room`: `--context 0,1 --target 2,3,4 --size 512 --upscale 2`; its photographs are too small
-/// for a larger input. Measured before depth was matched ([`Options::matching`]) and before dark frames were
-/// filled, with at most 1.5 million Gaussians at `High` and `Best`. Since then `High` gives fox 3,7 23.18 / .856
-/// and 10,16 20.94 / .767, in 30 and 34 s and 0.9 GiB.
+/// PSNR in dB / SSIM of new views, PSNR at the inputs' own cameras, CPU-seconds and memory, one run each on two cores
+/// of an EPYC with AVX-512. Pairs of `../shared/photos/fox`: `subsplat run fox --context 17,19 --target 18 --size
+/// 576x1024 --upscale 2 --quality LEVEL`, then 3,7 with 5, then 10,16 with 12,13,14; they overlap by 96, 90 and 75 %.
+/// `examples/room`: `--context 0,1 --target 2,3,4 --size 512 --upscale 2`; its photographs are too small for a larger
+/// input.
 ///
 /// | | fox 17,19 | fox 3,7 | fox 10,16 | room |
 /// |---|---|---|---|---|
-/// | `Fast` | 23.81 / .875, 27.6; 7 s, 0.3 GiB | | 20.13 / .753, 26.0; 9 s | 30.07 / .869, 33.1; 4 s, 0.2 GiB |
-/// | `Normal` | 23.75 / .877, 29.9; 23 s, 0.5 GiB | 21.90 / .833, 30.5; 21 s | 19.80 / .736, 29.8; 23 s | 31.91 / .907, 37.3; 15 s, 0.4 GiB |
-/// | `High` | 24.18 / .880, 31.6; 44 s, 1.3 GiB | 22.16 / .841, 32.1; 43 s | 19.84 / .723, 31.7; 45 s | as `Normal` |
-/// | `Best` | 24.14 / .877, 32.4; 73 s, 1.3 GiB | 22.18 / .837, 33.5; 65 s | 19.76 / .717, 33.5; 62 s | 32.25 / .912, 37.9; 22 s |
-/// | `High`, all 2.4 million, not refined | 23.90 / .867, 31.0; 27 s, 1.4 GiB | | | |
-/// | `Best`, all 2.4 million | 23.98 / .876, 32.9; 112 s, 1.7 GiB | 21.84 / .836, 35.0; 107 s | 19.62 / .717, 34.5; 115 s | |
+/// | `Fast` | 32.21 / .892, 35.1; 7 s, 0.3 GiB | 29.32 / .872, 34.4; 7 s | 24.50 / .800, 34.0; 8 s | 31.45 / .893, 36.8; 4 s, 0.2 GiB |
+/// | `Normal` | 32.66 / .899, 37.8; 16 s, 0.5 GiB | 29.68 / .865, 37.5; 16 s | 24.78 / .789, 37.0; 16 s | 32.30 / .907, 38.3; 9 s, 0.4 GiB |
+/// | `High` | 32.46 / .897, 38.7; 23 s, 0.8 GiB | 29.59 / .860, 38.0; 23 s | 23.98 / .773, 38.3; 25 s | as `Normal` |
+/// | `Best` | 32.36 / .894, 39.9; 37 s, 0.8 GiB | 29.38 / .853, 40.0; 37 s | 23.76 / .761, 41.0; 39 s | 32.38 / .909, 38.5; 17 s, 0.4 GiB |
 ///
-/// A higher level therefore comes closer to the photographs at their own cameras. New views gain where
-/// the photographs overlap by 90 % or more, and not where they overlap by 75 %.
+/// A higher level therefore comes closer to the photographs at their own cameras, and is sharper there. New views of
+/// two photographs do not gain: a larger input finds less depth that is right (the paper's table 2 in
+/// `tools/lab/tried.md`). At `--size 1080x1920` these pairs have 32.33, 29.00 and 24.21 dB with `Normal` (sharpness at
+/// the inputs .77 to .79) and 32.00, 29.84 and 23.03 with `High` (.84 to .87).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
 pub enum Quality {

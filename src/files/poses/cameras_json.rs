@@ -197,7 +197,9 @@ fn has_this_layout(path: &Path) -> Result<bool> {
         let frames = value.get("frames").and_then(serde_json::Value::as_array);
         frames.is_some_and(|frames| frames.iter().any(|frame| frame.get(key).is_some()))
     };
-    Ok(value.is_array() || has("c2w") || (by_name && !has("transform_matrix")))
+    let cameras = |list: &Vec<_>| list.iter().any(|c: &serde_json::Value| c.is_object());
+    let list = value.as_array().is_some_and(|list| name != "transforms.json" || cameras(list));
+    Ok(list || has("c2w") || (by_name && !has("transform_matrix")))
 }
 
 fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
