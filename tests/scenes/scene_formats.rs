@@ -214,6 +214,37 @@ fn the_content_of_a_file_decides_and_not_its_name() {
     }
 }
 
+/// Cameras outside the folder of the photographs name these by absolute paths; results have short names.
+#[test]
+fn names_that_lead_out_of_the_folder_lose_what_they_share() {
+    let (folder, mut cameras) = made_up(3);
+    let elsewhere = tempfile::tempdir().unwrap();
+    let path = elsewhere.path().join("cameras.json");
+    let names = |cameras: &[NamedCamera]| {
+        let content = CameraFile { cameras: cameras.to_vec(), ..Default::default() };
+        save_cameras_json(&path, &content).unwrap();
+        let frames = load_scene(&path).unwrap().frames;
+        frames.into_iter().map(|frame| frame.name).collect::<Vec<_>>()
+    };
+    let own: Vec<String> = cameras.iter().map(|c| c.file.clone()).collect();
+    for c in &mut cameras {
+        c.file = folder.path().join(&c.file).to_str().unwrap().to_owned();
+    }
+    let stem = |file: &String| file[7..].trim_end_matches(".png").to_owned();
+    assert_eq!(names(&cameras), own.iter().map(stem).collect::<Vec<_>>());
+    // Two of them in folders of their own.
+    for (i, sub) in ["a", "b"].into_iter().enumerate() {
+        let to = folder.path().join(sub).join("x.png");
+        std::fs::create_dir(to.parent().unwrap()).unwrap();
+        std::fs::rename(&cameras[i].file, &to).unwrap();
+        cameras[i].file = to.to_str().unwrap().to_owned();
+    }
+    assert_eq!(
+        names(&cameras),
+        ["a/x".to_owned(), "b/x".to_owned(), format!("images/{}", stem(&own[2]))]
+    );
+}
+
 #[test]
 fn transforms_json_variants_are_read() {
     let (folder, cameras) = made_up(3);

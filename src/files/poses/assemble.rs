@@ -358,6 +358,7 @@ pub(super) fn assemble(
         let got = format!("none of {count} (the first is `{first}`){searched}");
         return Err(Error::format(path, expected, got));
     }
+    shorten_names(&mut frames);
     let mut warnings = notes.lines(count);
     warnings.extend(scaled);
     if origin != DVec3::ZERO {
@@ -523,6 +524,28 @@ pub(super) fn frame_name(file: &str) -> String {
         Some((stem, extension)) if is_extension(extension) && !stem.is_empty() => stem.to_owned(),
         _ => name.to_owned(),
     }
+}
+
+/// Takes the folder that all frames share from their names where these lead out of the scene's folder: results are
+/// files of these names.
+fn shorten_names(frames: &mut [Frame]) {
+    let leads_out = |name: &str| {
+        let drive = name.as_bytes().get(1) == Some(&b':');
+        name.starts_with('/') || name.starts_with("../") || drive
+    };
+    if !frames.iter().any(|frame| leads_out(&frame.name)) {
+        return;
+    }
+    let folder = |frame: &Frame| frame.name.rfind('/').map_or(0, |end| end + 1);
+    let Some((first, others)) = frames.split_first() else { return };
+    let mut shared = first.name[..folder(first)].to_owned();
+    for frame in others {
+        while !frame.name.starts_with(&shared) {
+            let end = shared.trim_end_matches('/').rfind('/').map_or(0, |end| end + 1);
+            shared.truncate(end);
+        }
+    }
+    frames.iter_mut().for_each(|frame| frame.name.replace_range(..shared.len(), ""));
 }
 
 /// Derives the scene's name from the nearest folder that is not part of a format's layout.

@@ -185,20 +185,31 @@ fn say_left_out(folder: &Path, found: &FolderPhotographs, strict: bool) -> Resul
     Ok(())
 }
 
-/// The photographs of a folder without cameras, or of the one folder below it that has some.
+/// The photographs of a folder without cameras, or of the one folder in the two levels below it that has some.
 fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
     let mut found = find_photographs(folder);
     let mut name = folder.to_owned();
     let mut below: Vec<(PathBuf, FolderPhotographs)> = Vec::new();
     if found.photographs.is_empty() {
-        let photographs = |below: &PathBuf| !is_own_output(below) && !is_folder_of_masks(below);
-        let folders = folders(folder).into_iter().filter(photographs);
-        below = folders.map(|folder| (folder.clone(), find_photographs(&folder))).collect();
-        below.retain(|(_, found)| !found.photographs.is_empty());
+        let first = photograph_folders(folder);
+        below = with_photographs(&first);
+        if below.is_empty() {
+            if let Some(scene) = first.iter().find(|folder| has_scene(folder)) {
+                bail!(
+                    "{}: expected a scene or photographs, got a folder with a scene below it: give {}",
+                    folder.display(),
+                    scene.display()
+                );
+            }
+            let second: Vec<PathBuf> = first.iter().flat_map(|f| photograph_folders(f)).collect();
+            below = with_photographs(&second);
+        }
         if below.len() == 1 {
             (name, found) = below.remove(0);
             print_line(format!("the photographs are those of {}", name.display()));
         }
+    } else if let Some(note) = beside(folder, &found.photographs) {
+        print_warning(note);
     }
     say_left_out(&name, &found, strict)?;
     if let Some(cameras) = not_read(folder) {
@@ -226,6 +237,41 @@ fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
         found.photographs.len()
     );
     Ok(found.photographs)
+}
+
+/// Folders of a folder that may have photographs: no results of an earlier run, no masks.
+fn photograph_folders(folder: &Path) -> Vec<PathBuf> {
+    let mut all = folders(folder);
+    all.retain(|below| !is_own_output(below) && !is_folder_of_masks(below));
+    all
+}
+
+/// Those of `all` that have photographs, with these.
+fn with_photographs(all: &[PathBuf]) -> Vec<(PathBuf, FolderPhotographs)> {
+    let found = all.iter().map(|folder| (folder.clone(), find_photographs(folder)));
+    found.filter(|(_, found)| !found.photographs.is_empty()).collect()
+}
+
+/// A line about pictures in folders of `folder`, whose own `photographs` are used; `None` where there are none.
+fn beside(folder: &Path, photographs: &[PathBuf]) -> Option<String> {
+    let extension = |path: &Path| path.extension().map(|e| e.to_ascii_lowercase());
+    let kinds: Vec<_> = photographs.iter().map(|path| extension(path)).collect();
+    let count = |below: &PathBuf| {
+        let files = std::fs::read_dir(below).into_iter().flatten().flatten();
+        files.filter(|file| kinds.contains(&extension(&file.path()))).count()
+    };
+    let counts = photograph_folders(folder).into_iter().map(|below| (count(&below), below));
+    let others: Vec<String> = counts
+        .filter(|(count, _)| *count > 0)
+        .map(|(count, below)| format!("{} ({count})", below.display()))
+        .collect();
+    (!others.is_empty()).then(|| {
+        format!(
+            "{}: pictures in folders of it are not used: {}; give all folders if they show one place",
+            folder.display(),
+            others.join(", ")
+        )
+    })
 }
 
 /// Arguments of an estimation of cameras.

@@ -85,6 +85,51 @@ fn a_folder_of_photographs_becomes_a_scene() {
     assert!(place.path().join("out/scene.ply").is_file());
 }
 
+/// Photographs two levels down are found, a scene there is named, and those of a folder beside others are not left
+/// out without a word.
+#[test]
+fn photographs_deeper_in_a_folder_are_found_or_named() {
+    let place = folder();
+    let at = |path: &str| place.path().join(path);
+    let poses = |path: &str| {
+        call_in(place.path(), &format!("poses {path} --intrinsics {INTRINSICS} -o out.json"))
+    };
+    fs::create_dir_all(at("phone/DCIM")).unwrap();
+    fs::rename(at("photos"), at("phone/DCIM/100APPLE")).unwrap();
+    let called = poses("phone");
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    assert!(called.stderr.contains("100APPLE") || called.stdout.contains("100APPLE"));
+    // Two folders of photographs.
+    fs::create_dir(at("phone/DCIM/101APPLE")).unwrap();
+    for name in ["input_0.png", "input_1.png"] {
+        fs::copy(at("phone/DCIM/100APPLE").join(name), at("phone/DCIM/101APPLE").join(name))
+            .unwrap();
+    }
+    let called = poses("phone");
+    assert!(
+        called.code != 0 && called.stderr.contains("101APPLE (2 photographs)"),
+        "{}",
+        called.stderr
+    );
+    // Photographs beside a folder of others.
+    fs::rename(at("phone/DCIM/100APPLE"), at("photos")).unwrap();
+    fs::rename(at("phone/DCIM/101APPLE"), at("photos/more")).unwrap();
+    let called = poses("photos");
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let note = called.stderr.lines().find(|line| line.contains("not used"));
+    assert!(note.is_some_and(|note| note.contains("more (2)")), "{}", called.stderr);
+    fs::remove_dir_all(at("photos/more")).unwrap();
+    assert!(!poses("photos").stderr.contains("not used"));
+    // A scene two levels down.
+    fs::create_dir_all(at("project/a/scene")).unwrap();
+    fs::rename(at("photos"), at("project/a/scene/images")).unwrap();
+    let cameras = fs::read(at("out.json")).unwrap();
+    let text = String::from_utf8(cameras).unwrap().replace("photos/", "images/");
+    fs::write(at("project/a/scene/cameras.json"), text).unwrap();
+    let called = poses("project");
+    assert!(called.code != 0 && called.stderr.contains("give project/a"), "{}", called.stderr);
+}
+
 #[test]
 fn all_of_three_photographs_are_used() {
     let place = folder();
