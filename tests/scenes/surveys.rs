@@ -129,6 +129,21 @@ fn a_survey_is_its_local_frame() {
     }
 }
 
+/// A file of Metashape without cameras leaves the photographs to the estimation, with a line.
+#[test]
+fn an_export_without_cameras_is_named_and_not_read() {
+    let (folder, _) = plain(3);
+    let path = folder.path().join("markers.xml");
+    write(&path, r#"<document version="1.2.0"><chunk><sensors/><cameras/></chunk></document>"#);
+    assert!(!is_scene(folder.path()));
+    let line = not_read(folder.path()).unwrap();
+    assert!(
+        line.contains("markers.xml") && line.contains("Metashape has exported no cameras"),
+        "{line}"
+    );
+    assert!(load_scene(&path).unwrap_err().to_string().contains("at least one frame"));
+}
+
 #[test]
 fn sensors_of_metashape() {
     let (folder, cameras) = plain(2);

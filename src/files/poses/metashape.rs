@@ -85,6 +85,11 @@ pub(super) fn is_export(path: &Path) -> bool {
     text.contains("<document") && text.contains("<chunk")
 }
 
+/// Returns whether a file names cameras: an export of markers has none.
+pub(super) fn has_cameras(path: &Path) -> bool {
+    read(path).is_ok_and(|bytes| String::from_utf8_lossy(&utf8(&bytes)).contains("<camera "))
+}
+
 /// Number of placed cameras; 0 where the file cannot be read.
 pub(super) fn count(path: &Path) -> usize {
     let cameras = read(path).and_then(|bytes| parse(path, &bytes)).map(|file| file.cameras);

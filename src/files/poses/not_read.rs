@@ -4,6 +4,7 @@ use super::assemble::files;
 use super::find::JSON_FILES;
 use super::json::is_list;
 use super::matrices::parse_matrix;
+use super::metashape;
 use crate::files::{first_bytes, lower_extension, read};
 use std::path::{Path, PathBuf};
 
@@ -52,6 +53,14 @@ fn line(folder: &Path) -> Option<String> {
     }
     if let Some(line) = damaged(folder) {
         return Some(line);
+    }
+    let is_empty_export = |path: &&PathBuf| {
+        lower_extension(path) == "xml"
+            && metashape::is_export(path)
+            && !metashape::has_cameras(path)
+    };
+    if let Some(path) = own.iter().find(is_empty_export) {
+        return Some(format!("{}: Metashape has exported no cameras into it", path.display()));
     }
     if let Some(path) = reality_capture(folder, &own) {
         return Some(format!(
