@@ -43,7 +43,7 @@ pub(crate) use refine::refine_groups;
 #[cfg(feature = "network")]
 pub use removal::Groups;
 #[cfg(feature = "network")]
-pub(crate) use removal::{LEAST_SHARE, families, hidden, shares, shown};
+pub(crate) use removal::{LEAST_SHARE, families, hidden, shares, shares_of_marked, shown};
 #[cfg(feature = "network")]
 pub(crate) use targets::MaskedView;
 

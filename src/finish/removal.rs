@@ -118,10 +118,21 @@ pub(crate) fn shares(
     }
     // An average parent is one of all.
     let factor = visible.len() as f32 / number.max(1) as f32;
-    let shares = shares_of_visible(&families(splats, &visible), views, raster, renderer);
-    let mut shares = shares.into_iter();
-    let share = |visible: bool| if visible { factor * shares.next().unwrap_or(0.0) } else { 0.0 };
-    visible.into_iter().map(share).collect()
+    let shares = shares_of_marked(splats, &visible, views, raster, renderer);
+    shares.into_iter().map(|share| factor * share).collect()
+}
+
+/// [`shares`] of the parents that `marked` names, drawn without the others; 0 for these.
+pub(crate) fn shares_of_marked(
+    splats: &Splats,
+    marked: &[bool],
+    views: &[MaskedView<'_>],
+    raster: &RasterOptions,
+    renderer: &mut Renderer,
+) -> Vec<f32> {
+    let mut of_marked = shares(&families(splats, marked), views, raster, renderer).into_iter();
+    let share = |marked: &bool| if *marked { of_marked.next().unwrap_or(0.0) } else { 0.0 };
+    marked.iter().map(share).collect()
 }
 
 /// Share of each parent in the photographs: the weights T·α of its children, summed over all
@@ -229,7 +240,7 @@ mod tests {
         assert!((masked - seen).abs() < 0.01 * seen, "{masked} {seen}");
     }
 
-    /// What is transparent has no share and changes none; of more parents than may stay, those with the largest
+    /// Transparent parents have no share and change none; of more parents than may stay, those with the largest
     /// shares do.
     #[test]
     fn transparent_parents_have_no_share_and_the_largest_stay() {

@@ -5,7 +5,7 @@ use super::density::{Density, counts, grids};
 use super::detail::{self, add_detail};
 use super::finishing::{groups_of, input_views, kept_parents};
 use super::{Error, Result};
-use crate::finish::{Groups, LEAST_SHARE, MaskedView, families, hidden, shares};
+use crate::finish::{Groups, LEAST_SHARE, families, hidden, shares, shares_of_marked};
 use crate::network::model::scene_encoding::SceneEncoding;
 use crate::network::model::subsplat::{SceneOutput, SubSplat};
 use crate::network::model::trace::Checkpoint;
@@ -95,7 +95,7 @@ pub fn counts_of(
     };
     let photographs = input_views(inputs);
     let mut shares = match &kept {
-        Some(kept) => shares_of_kept(&parents, kept, &photographs, raster, renderer),
+        Some(kept) => shares_of_marked(&parents, kept, &photographs, raster, renderer),
         None => shares(&parents, &photographs, raster, renderer),
     };
     let mut limit = density.limit(number, inputs.len(), upscale);
@@ -117,19 +117,6 @@ pub fn counts_of(
         *count = 0;
     }
     Ok(Some(Counts::Mixed { counts, parents }))
-}
-
-/// Shares of the parents that `kept` marks, without the others; 0 for these.
-fn shares_of_kept(
-    parents: &Splats,
-    kept: &[bool],
-    photographs: &[MaskedView<'_>],
-    raster: &RasterOptions,
-    renderer: &mut Renderer,
-) -> Vec<f32> {
-    let mut of_kept = shares(&families(parents, kept), photographs, raster, renderer).into_iter();
-    let share = |kept: &bool| if *kept { of_kept.next().unwrap_or(0.0) } else { 0.0 };
-    kept.iter().map(share).collect()
 }
 
 /// K of [`Density::Each`].

@@ -129,8 +129,8 @@ pub fn options_of_parents(
 
 /// Fits and refines `parents` on the photographs of the input's size, which `raster` renders, by
 /// [`options_of_parents`]. Those that the photographs hardly show, those above [`ParentsOptions::most`] and those of
-/// masked pixels become transparent instead, and get no children. `progress` receives the refinement after each step, and `None` after each step of
-/// the fit.
+/// masked pixels become transparent instead, and get no children. `progress` receives the refinement after each step,
+/// and `None` after each step of the fit.
 ///
 /// # Errors
 /// [`Error::Cancelled`].

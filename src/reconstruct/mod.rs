@@ -105,6 +105,7 @@ pub mod stages {
     pub use super::equal_exposure::equalise;
     pub use super::finishing::{fit_to_inputs, refine_on_inputs};
     pub use super::poses::{adjusted, adjusted_if_doubted, check_pairs, located};
+    pub use super::repeated::hide_repeated;
     pub use super::surroundings::add_surroundings;
     pub use crate::finish::Groups;
 }

@@ -1,7 +1,7 @@
 //! Photographs that are cropped and checked, and the network's run on them.
 
 use super::progress::Tracker;
-use super::repeated::{self, hide_repeated};
+use super::repeated::hide_repeated;
 use super::unit;
 use super::{
     DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, SceneChildren,
@@ -144,9 +144,7 @@ impl Prepared<'_> {
                 let mut part = tracker.parts(progress);
                 factors = match_parents(&mut own, &inputs, bounds.near_far(), &mut part)?;
             }
-            // A scene that may have all children keeps all parents.
-            let most = repeated::MOST.max(most / config.upscale.pow(2));
-            hide_repeated(&mut own, &inputs, most);
+            hide_repeated(&mut own, &inputs, most, config.upscale);
             if let Some(options) = &parents_options {
                 tracker.begin(Stage::Parents, progress)?;
                 let mut part = tracker.parts(progress);

@@ -18,7 +18,7 @@ use subsplat_kernels::camera::Camera;
 use subsplat_kernels::layout::{MEAN_OFFSET, OPACITY_OFFSET, SPLAT_STRIDE};
 
 /// Most parents whose shares are computed in one pass: those of ten photographs of 256×256 px.
-pub const MOST: usize = 700_000;
+const MOST: usize = 700_000;
 /// Largest difference of two depths of one surface, as a share of the depth: two steps of the plane sweep.
 const SAME_SURFACE: f32 = 0.02;
 /// Fewest parents of a parallel task.
@@ -49,9 +49,15 @@ impl View<'_> {
     }
 }
 
-/// Makes parents of `inputs`, one for each pixel, transparent where there are more than `most`: those whose surface
-/// most other photographs show larger. Another number of parents, and at most `most`, stay as they are.
-pub fn hide_repeated(parents: &mut Splats, inputs: &[Cropped], most: usize) {
+/// Makes parents of `inputs`, one for each pixel, transparent where there are more than 700,000 and more than the
+/// parents of `gaussians` Gaussians, r² each of r = `upscale`: a scene that may have all children keeps all parents.
+pub fn hide_repeated(parents: &mut Splats, inputs: &[Cropped], gaussians: usize, upscale: usize) {
+    hide_beyond(parents, inputs, MOST.max(gaussians / upscale.pow(2)));
+}
+
+/// Makes parents transparent where there are more than `most`: those whose surface most other photographs show larger.
+/// Parents that are not one for each pixel stay as they are.
+fn hide_beyond(parents: &mut Splats, inputs: &[Cropped], most: usize) {
     let pixels: usize = inputs.iter().map(|c| c.input.width * c.input.height).sum();
     if parents.len() != pixels || parents.len() <= most {
         return;
@@ -119,7 +125,6 @@ fn larger_elsewhere(rows: &[f32], views: &[View<'_>]) -> Vec<Option<u16>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reconstruct::inputs::crop::PhotoWindow;
     use crate::scene::pictures::Rgb;
     use glam::{Mat4, Vec2};
     use subsplat_kernels::camera::Intrinsics;
@@ -131,17 +136,7 @@ mod tests {
     fn photograph(distance: f32) -> Cropped {
         let k = Intrinsics::from_fov_x(1.0, SIDE, SIDE);
         let pose = Mat4::from_translation(Vec3::new(0.0, 0.0, -distance));
-        let (input_camera, input) = (Camera::new(k, pose).unwrap(), Rgb::black(SIDE, SIDE));
-        Cropped {
-            target: input.clone(),
-            input,
-            input_mask: None,
-            input_camera,
-            target_mask: None,
-            target_camera: input_camera,
-            window: PhotoWindow { scale: Vec2::ONE, origin: Vec2::ZERO },
-            frame: 0,
-        }
+        Cropped::of_whole(Rgb::black(SIDE, SIDE), Camera::new(k, pose).unwrap())
     }
 
     /// The wall's parents, at a depth times `factor`.
@@ -173,7 +168,7 @@ mod tests {
         let inputs = [photograph(4.0), photograph(2.0), photograph(1.0)];
         let at = |most: usize| {
             let mut splats = parents(&inputs, 1.0);
-            hide_repeated(&mut splats, &inputs, most);
+            hide_beyond(&mut splats, &inputs, most);
             visible(&splats)
         };
         assert_eq!(at(3 * ALL), [ALL; 3]);
@@ -190,17 +185,17 @@ mod tests {
         const ALL: usize = SIDE * SIDE;
         let mut inputs = [photograph(2.0), photograph(2.0)];
         let mut splats = parents(&inputs, 1.0);
-        hide_repeated(&mut splats, &inputs, 1);
+        hide_beyond(&mut splats, &inputs, 1);
         assert_eq!(visible(&splats), [ALL, 0], "of equal ones the first stay");
         // 5 % behind the wall.
         let (mut first, second) = (parents(&inputs, 1.0), parents(&inputs, 1.05));
         first.rows.splice(ALL * SPLAT_STRIDE.., second.rows[ALL * SPLAT_STRIDE..].to_vec());
-        hide_repeated(&mut first, &inputs, 1);
+        hide_beyond(&mut first, &inputs, 1);
         assert_eq!(visible(&first), [ALL, ALL]);
         let left_half = (0..ALL).map(|i| i % SIDE < SIDE / 2).collect();
         inputs[0].input_mask = Mask::new(SIDE, SIDE, left_half);
         let mut splats = parents(&inputs, 1.0);
-        hide_repeated(&mut splats, &inputs, 1);
+        hide_beyond(&mut splats, &inputs, 1);
         assert_eq!(visible(&splats), [ALL / 2, ALL / 2]);
     }
 }

@@ -260,7 +260,6 @@ pub fn restore_surroundings(splats: &mut Splats, taken: Splats) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reconstruct::inputs::crop::PhotoWindow;
     use crate::scene::pictures::Rgb;
     use glam::Mat4;
     use subsplat_kernels::camera::{Camera, Intrinsics};
@@ -277,20 +276,8 @@ mod tests {
 
     /// A red photograph.
     fn photograph(x: f32) -> Cropped {
-        let (camera, image) = (
-            camera(x, 1.0),
-            Rgb { width: SIDE, height: SIDE, data: [200, 40, 20].repeat(SIDE * SIDE) },
-        );
-        Cropped {
-            input: image.clone(),
-            input_mask: None,
-            input_camera: camera,
-            target: image,
-            target_mask: None,
-            target_camera: camera,
-            window: PhotoWindow { scale: Vec2::ONE, origin: Vec2::ZERO },
-            frame: 0,
-        }
+        let red = Rgb { width: SIDE, height: SIDE, data: [200, 40, 20].repeat(SIDE * SIDE) };
+        Cropped::of_whole(red, camera(x, 1.0))
     }
 
     /// A wall that the photographs show, of families of `children` Gaussians.

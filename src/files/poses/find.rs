@@ -293,10 +293,8 @@ fn foreign(folder: &Path) -> Vec<(PoseFile, &'static str)> {
     if path.is_file() {
         all.push((PoseFile::Llff(path), "LLFF"));
     }
-    let exports = by_content(folder, "xml", metashape::is_export, PoseFile::Metashape);
-    // An export of markers has no cameras (`not_read` names it).
-    let exports = exports.into_iter().filter(|file| metashape::has_cameras(file.path()));
-    all.extend(exports.map(|file| (file, "Metashape")));
+    let exports = by_content(folder, "xml", metashape::has_cameras, PoseFile::Metashape);
+    all.extend(exports.into_iter().map(|file| (file, "Metashape")));
     let tables = by_content(folder, "csv", reality_capture::is_table, PoseFile::RealityCapture);
     all.extend(tables.into_iter().map(|file| (file, "RealityCapture")));
     all.extend(of_reconstructions(folder));

@@ -85,9 +85,10 @@ pub(super) fn is_export(path: &Path) -> bool {
     text.contains("<document") && text.contains("<chunk")
 }
 
-/// Returns whether a file names cameras: an export of markers has none.
+/// Reports whether a file is an export that names cameras: one of markers has none.
 pub(super) fn has_cameras(path: &Path) -> bool {
-    read(path).is_ok_and(|bytes| String::from_utf8_lossy(&utf8(&bytes)).contains("<camera "))
+    let names_one = |bytes: Vec<u8>| String::from_utf8_lossy(&utf8(&bytes)).contains("<camera ");
+    is_export(path) && read(path).is_ok_and(names_one)
 }
 
 /// Number of placed cameras; 0 where the file cannot be read.

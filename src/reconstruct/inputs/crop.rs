@@ -306,6 +306,23 @@ pub fn crop_masked(
     })
 }
 
+#[cfg(test)]
+impl Cropped {
+    /// A whole photograph at its own size.
+    pub(crate) fn of_whole(picture: Rgb, camera: Camera) -> Self {
+        Self {
+            input: picture.clone(),
+            input_mask: None,
+            input_camera: camera,
+            target: picture,
+            target_mask: None,
+            target_camera: camera,
+            window: PhotoWindow { scale: Vec2::ONE, origin: Vec2::ZERO },
+            frame: 0,
+        }
+    }
+}
+
 fn with_intrinsics(camera: &Camera, k: Intrinsics) -> Result<Camera> {
     let refused = |e: CameraError| Error::format("crop", "a valid resized camera", e.to_string());
     camera.with_intrinsics(k).map_err(refused)

@@ -14,8 +14,8 @@ use subsplat::network::model::trunk::Trunk;
 use subsplat::network::model::weights::Weights;
 use subsplat::reconstruct::inputs::crop::{Cropped, PhotoWindow};
 use subsplat::reconstruct::stages::{
-    ParentsOptions, SceneChildren, add_surroundings, counts_of, fit_to_inputs, match_parents,
-    options_of_parents, refine_on_inputs, refine_parents,
+    ParentsOptions, SceneChildren, add_surroundings, counts_of, fit_to_inputs, hide_repeated,
+    match_parents, options_of_parents, refine_on_inputs, refine_parents,
 };
 use subsplat::reconstruct::{
     Density, DepthBounds, DepthRange, Error, Reconstructor, Refine, Result,
@@ -383,8 +383,9 @@ impl<'a> PictureMaker<'a> {
             match_parents(&mut own, inputs, near_far, &mut part)?;
         }
         let options = self.refine.options_for(inputs.len(), true);
-        let count = encoding.per_view() * inputs.len();
-        let most = self.density.limit(count, inputs.len(), model.config().upscale);
+        let (count, upscale) = (encoding.per_view() * inputs.len(), model.config().upscale);
+        let most = self.density.limit(count, inputs.len(), upscale);
+        hide_repeated(&mut own, inputs, most, upscale);
         let options =
             options_of_parents(&options, inputs, most).filter(|_| parents != Parents::Predicted);
         if let Some(options) = options {
