@@ -81,6 +81,19 @@ impl Error {
         }
     }
 
+    /// The message without the path of the file, where a sentence names it.
+    #[must_use]
+    pub fn reason(&self) -> String {
+        match self {
+            Self::Io { source, .. } => source.to_string(),
+            Self::Format { at, expected, got, .. } => {
+                let place = at.trim_start();
+                let place = if place.is_empty() { String::new() } else { format!("{place}: ") };
+                format!("{place}expected {expected}, got {got}")
+            }
+        }
+    }
+
     /// Returns the same error at a place in the file: `:12`, ` at byte 96`, ` frame 3`.
     #[must_use]
     pub fn at(mut self, place: impl Into<String>) -> Self {

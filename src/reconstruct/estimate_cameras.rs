@@ -7,7 +7,8 @@
 use super::projections::{self, Posed, Prepared, Projection, Shapes};
 use super::{Error, Photo, Result};
 use crate::cameras::estimation::{
-    Confidence, Lens, PoseEstimate, PoseOptions, PosePhoto, PoseWarning, RadialLens, estimate_poses,
+    Confidence, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PoseWarning, RadialLens,
+    estimate_poses,
 };
 use crate::files::photos::exif::FocalSource;
 use crate::files::photos::image::LoadOptions;
@@ -79,6 +80,9 @@ pub struct EstimateOptions {
     /// [`EstimateOptions::lens`] has no effect. [`estimate_cameras`] reads [`Projection::Pinhole`] alone: lenses do not
     /// bend lines.
     pub projection: Projection,
+    /// Makes a photograph that [`estimate_cameras_of_files`] cannot use an error. By default such a photograph is left
+    /// out where two others remain.
+    pub strict: bool,
 }
 
 /// Result of [`estimate_cameras_of_files`]: a scene with estimated cameras.
@@ -90,7 +94,7 @@ pub struct EstimatedScene {
     pub observations: Vec<Vec<(usize, [f32; 2])>>,
     /// The estimate; its indices count all photographs.
     pub estimate: PoseEstimate,
-    /// Origin of each photograph's focal length.
+    /// Origin of each photograph's focal length; [`LensSource::Assumed`] of one that cannot be read.
     pub lenses: Vec<LensSource>,
     /// The lens whose bend was taken out of the photographs: the frames are straight views of them.
     pub straightened: Option<RadialLens>,
@@ -202,8 +206,9 @@ fn straight_estimate<T>(
 /// One photograph is decoded at a time, so that memory holds one at its full size.
 ///
 /// # Errors
-/// Those of [`load_photograph`](crate::load_photograph), but panoramas are accepted; a lens that is no valid camera; [`Error::NoPoses`]; the error of
-/// `photograph`.
+/// Those of [`load_photograph`](crate::load_photograph) where fewer than two photographs are without one, or with
+/// [`EstimateOptions::strict`], but panoramas are accepted; a lens that is no valid camera; [`Error::NoPoses`]; the error
+/// of `photograph`.
 pub fn estimate_cameras_of_files(
     name: impl AsRef<Path>,
     photographs: &[impl AsRef<Path>],
@@ -214,21 +219,68 @@ pub fn estimate_cameras_of_files(
     estimate_scene(name.as_ref(), &photographs, options, photograph)
 }
 
+/// The photographs that can be used.
+struct Usable<'a> {
+    prepared: Vec<Prepared>,
+    paths: Vec<&'a Path>,
+    /// Index of each among all photographs.
+    of_all: Vec<usize>,
+    /// The others, with their errors.
+    left_out: Vec<LeftOut>,
+    /// Warnings about each.
+    said: Vec<Vec<String>>,
+}
+
+/// Reads the photographs and leaves out those that cannot be used.
+///
+/// # Errors
+/// The first error of a photograph where fewer than two can be used; any with [`EstimateOptions::strict`].
+fn usable<'a>(
+    photographs: &[&'a Path],
+    options: &EstimateOptions,
+    photograph: &mut dyn FnMut(usize) -> Result<()>,
+) -> Result<Usable<'a>> {
+    let features = features_of(photographs.len());
+    let mut usable = Usable {
+        prepared: Vec::new(),
+        paths: Vec::new(),
+        of_all: Vec::new(),
+        left_out: Vec::new(),
+        said: Vec::new(),
+    };
+    let mut first_error = None;
+    for (photo, path) in photographs.iter().enumerate() {
+        photograph(photo)?;
+        match projections::prepare(path, options, features) {
+            Ok(mut one) => {
+                usable.said.push(std::mem::take(&mut one.warnings));
+                usable.prepared.push(one);
+                usable.paths.push(path);
+                usable.of_all.push(photo);
+            }
+            Err(Error::Io(error)) if !options.strict => {
+                usable.left_out.push(LeftOut { photo, reason: error.reason() });
+                first_error.get_or_insert(error);
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    match first_error {
+        Some(error) if usable.prepared.len() < 2 => Err(error.into()),
+        _ => Ok(usable),
+    }
+}
+
 fn estimate_scene(
     name: &Path,
-    photographs: &[&Path],
+    all: &[&Path],
     options: &EstimateOptions,
     photograph: &mut dyn FnMut(usize) -> Result<()>,
 ) -> Result<EstimatedScene> {
-    let features = features_of(photographs.len());
-    let mut said: Vec<Vec<String>> = Vec::new();
-    let mut prepared = Vec::new();
-    for (i, path) in photographs.iter().enumerate() {
-        photograph(i)?;
-        let mut one = projections::prepare(path, options, features)?;
-        said.push(std::mem::take(&mut one.warnings));
-        prepared.push(one);
-    }
+    let features = features_of(all.len());
+    let Usable { prepared, paths: photographs, of_all, left_out, said } =
+        usable(all, options, photograph)?;
+    let photographs = photographs.as_slice();
     let mut warnings = grouped(photographs.iter().copied().zip(said.iter().map(Vec::as_slice)));
     let split = |prepared: Vec<Prepared>| {
         let shapes = Shapes::new(&prepared);
@@ -253,7 +305,7 @@ fn estimate_scene(
         let (photos, (shapes, _)) = split(prepared);
         Ok((photos, (shapes, said)))
     };
-    let (estimate, straightened) = straight_estimate(first, options, straight);
+    let (mut estimate, straightened) = straight_estimate(first, options, straight);
     let straightened = straightened.map(|(radial, (of_views, said))| {
         shapes = of_views;
         warnings.extend(grouped(photographs.iter().copied().zip(said.iter().map(Vec::as_slice))));
@@ -270,10 +322,13 @@ fn estimate_scene(
         }
     }
     scene.warnings.extend(warnings);
-    let file = |photo: usize| photographs[photo].display().to_string();
+    let mut lenses_of_all = vec![LensSource::Assumed; all.len()];
+    of_all.iter().zip(lenses).for_each(|(&photo, lens)| lenses_of_all[photo] = lens);
+    estimate.count_among(&of_all, all.len(), left_out);
+    let file = |photo: usize| all[photo].display().to_string();
     scene.warnings.extend(estimate.left_out_sentences(file));
     scene.warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
-    Ok(EstimatedScene { scene, observations, estimate, lenses, straightened })
+    Ok(EstimatedScene { scene, observations, estimate, lenses: lenses_of_all, straightened })
 }
 
 /// Returns the known part of a photograph's lens, and its source.

@@ -170,3 +170,33 @@ fn what_a_picture_looks_like_is_said_where_the_cameras_fail() {
     let error = estimated(&[square.clone(), square], Projection::Panorama).unwrap_err().to_string();
     assert!(error.contains("twice as wide as high") && error.contains("1024x300"), "{error}");
 }
+
+/// A photograph that cannot be used is left out, and the indices of the others stay.
+#[test]
+fn one_bad_photograph_is_left_out_of_several() {
+    let folder = tempfile::tempdir().unwrap();
+    let pictures = [0, 1].map(|i| panorama(WIDTH, places()[i].1, places()[i].0));
+    let mut files = save_pictures(folder.path(), &pictures);
+    let cut = folder.path().join("cut.png");
+    let bytes = std::fs::read(&files[0]).unwrap();
+    std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    files.insert(1, cut);
+    let mut options = EstimateOptions::default();
+    let read = |files: &[std::path::PathBuf], options: &EstimateOptions| {
+        estimate_cameras_of_files(folder.path(), files, options, &mut |_| Ok(()))
+    };
+    let found = read(&files, &options).unwrap();
+    let estimate = &found.estimate;
+    let placed: Vec<bool> = estimate.cameras.iter().map(Option::is_some).collect();
+    assert_eq!(placed, [true, false, true]);
+    assert_eq!((found.lenses.len(), estimate.left_out.len()), (3, 1));
+    assert_eq!((estimate.left_out[0].photo, found.scene.frames.len()), (1, 12));
+    let photos = estimate.points.iter().flat_map(|p| p.observations.iter().map(|o| o.0));
+    assert!(photos.clone().any(|photo| photo == 2) && photos.clone().all(|photo| photo != 1));
+    let line = found.scene.warnings.iter().find(|w| w.contains("cut.png is left out: expected"));
+    assert!(line.is_some(), "{:?}", found.scene.warnings);
+    // It is needed, or a strict reading refuses it.
+    assert!(read(&files[..2], &options).unwrap_err().to_string().contains("cut.png: expected"));
+    options.strict = true;
+    assert!(read(&files, &options).unwrap_err().to_string().contains("cut.png: expected"));
+}

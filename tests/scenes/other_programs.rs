@@ -600,8 +600,38 @@ fn hostile_archives_of_neus() {
     left_out(&load_scene(folder.path()).unwrap(), &[(0, "a projection K"), (1, "a projection K")]);
     refused("one missing", neus::parse("a.npz", &npz(&arrays[2..])), &["world_mat_0.npy", "3 of"]);
     refused("none", neus::parse("a.npz", &npz(&[])), &["world_mat_0.npy", "0 of"]);
-    std::fs::remove_file(folder.path().join("images/002.png")).unwrap();
-    refused("a picture", load_scene(folder.path()), &["4 pictures", "0, 3, 0"]);
+}
+
+/// Numbers in the names of pictures say which one is missing.
+#[test]
+fn a_picture_of_neus_may_be_missing() {
+    let (folder, cameras) = made_up(4);
+    let at = |name: &str| folder.path().join(name);
+    write(&at("cameras.npz"), npz(&neus_arrays(&cameras)));
+    let names: Vec<&str> = cameras.iter().map(|c| c.file.trim_start_matches("images/")).collect();
+    std::fs::create_dir(at("mask")).unwrap();
+    for name in &names {
+        save_png(at("mask").join(name), &noise(64, 48)).unwrap();
+    }
+    std::fs::remove_file(at("images").join(names[2])).unwrap();
+    let gap = [cameras[0].clone(), cameras[1].clone(), cameras[3].clone()];
+    let scene = load_scene(folder.path()).unwrap();
+    check(&scene, SceneFormat::Neus, &gap);
+    left_out(&scene, &[(2, "no picture on disk")]);
+    let entries: Vec<usize> = scene.frames.iter().map(|frame| frame.entry).collect();
+    assert_eq!(entries, [0, 1, 3]);
+    assert_eq!(scene.frames[2].mask, Some(at("mask").join(names[3])));
+    // Names from 1 on.
+    for i in [3, 1, 0] {
+        let to = format!("images/p{}.png", i + 1);
+        std::fs::rename(at("images").join(names[i]), at(&to)).unwrap();
+    }
+    let scene = load_scene(folder.path()).unwrap();
+    let entries: Vec<usize> = scene.frames.iter().map(|frame| frame.entry).collect();
+    assert_eq!(entries, [0, 1, 3]);
+    // Neither the first number nor the last.
+    std::fs::remove_file(at("images/p4.png")).unwrap();
+    refused("a picture", load_scene(folder.path()), &["4 pictures", "0, 2, 0", "numbers"]);
 }
 
 #[test]

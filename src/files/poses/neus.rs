@@ -2,7 +2,8 @@
 //!
 //! `world_mat_N` is the projection K·[R | t] of the world into picture N, 3×4 or with a fourth row: `scale_mat_N`,
 //! which moves the scene into a sphere, is not applied, so that the cameras keep the world's unit. The pictures lie
-//! in `image`, and picture N is the N-th in the order of Python's `sorted`, that is, by bytes. Masks lie in `mask`.
+//! in `image`, and picture N is the N-th in the order of Python's `sorted`, that is, by bytes. Masks lie in `mask`. Where
+//! pictures are missing, the numbers in the names of the others say which.
 //!
 //! The decomposition: the rows of R come from those of the left 3×3 matrix M, from the last one upwards (Gram and
 //! Schmidt), and the factors are K. A projection is known up to its sign; that of det M makes R a rotation. The
@@ -131,9 +132,9 @@ pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let pictures = pictures(folder, path, cameras.len(), reading)?;
     let masks = MASKS.map(|name| sorted(&folder.join(name)));
-    let masks = masks.into_iter().find(|masks| masks.len() == pictures.len()).unwrap_or_default();
+    let masks = masks.iter().find_map(|masks| of_cameras(masks, cameras.len())).unwrap_or_default();
     let drafts = cameras.into_iter().enumerate().map(|(i, camera)| {
-        let image = pictures.get(i).cloned();
+        let image = pictures.get(i).cloned().flatten();
         let named = image.as_deref().and_then(Path::file_name);
         let name = named.map_or_else(|| i.to_string(), |n| n.to_string_lossy().into_owned());
         let camera = match camera {
@@ -144,7 +145,7 @@ pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
         let skew = if skew.abs() > SKEW { skew } else { 0.0 };
         let distortion = Distortion::polynomial([0.0; 4], [0.0; 2], skew);
         let (place, lens) = (format!(" {WORLD}{i}"), Lens::Pixels(focal_and_center));
-        let mask = masks.get(i).cloned();
+        let mask = masks.get(i).cloned().flatten();
         Draft { image, mask, distortion, ..Draft::new(place, name, lens, world_from_camera) }
     });
     let drafts = drafts.collect();
@@ -153,21 +154,55 @@ pub(super) fn load(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     Ok(scene)
 }
 
-/// The pictures of `count` cameras, of the first folder that has as many.
+/// The pictures of `count` cameras: of the first folder that has as many, else of the first whose names say which are
+/// missing.
 fn pictures(
     folder: &Path,
     path: &Path,
     count: usize,
     reading: &Reading<'_>,
-) -> Result<Vec<PathBuf>> {
+) -> Result<Vec<Option<PathBuf>>> {
     let places = reading.places(FOLDERS.iter().map(|name| folder.join(name)).collect());
     let mut all: Vec<Vec<PathBuf>> = places.iter().map(|place| sorted(place)).collect();
-    if let Some(i) = all.iter().position(|pictures| pictures.len() == count) {
-        return Ok(all.swap_remove(i));
+    // Stable: the order of preference stays among the others.
+    all.sort_by_key(|pictures| pictures.len() != count);
+    if let Some(pictures) = all.iter().find_map(|pictures| of_cameras(pictures, count)) {
+        return Ok(pictures);
     }
     let lengths: Vec<String> = all.iter().map(|pictures| pictures.len().to_string()).collect();
-    let expected = format!("{count} pictures in image or images, one for each {WORLD}N");
+    let expected = format!(
+        "{count} pictures in image or images, one for each {WORLD}N, or names with the numbers of their cameras"
+    );
     Err(Error::format(path, expected, format!("{} of them", lengths.join(", "))))
+}
+
+/// The file of each of `count` cameras among `files`, sorted: all of them in their order. Of fewer, the numbers that end
+/// their names say which they are, from 0 where one is 0, from 1 where one is `count`; `None` where they do not.
+fn of_cameras(files: &[PathBuf], count: usize) -> Option<Vec<Option<PathBuf>>> {
+    if files.len() == count {
+        return Some(files.iter().cloned().map(Some).collect());
+    }
+    let numbers = files.iter().map(|file| end_number(file)).collect::<Option<Vec<usize>>>()?;
+    let first = match [0, count].map(|number| numbers.contains(&number)) {
+        [true, false] => 0,
+        [false, true] => 1,
+        _ => return None,
+    };
+    let mut of = vec![None; count];
+    for (file, number) in files.iter().zip(numbers) {
+        let place = of.get_mut(number.checked_sub(first)?)?;
+        if place.replace(file.clone()).is_some() {
+            return None;
+        }
+    }
+    Some(of)
+}
+
+/// The number that ends the name of a file, without its extension.
+fn end_number(file: &Path) -> Option<usize> {
+    let stem = file.file_stem()?.to_str()?;
+    let start = stem.trim_end_matches(|c: char| c.is_ascii_digit()).len();
+    stem[start..].parse().ok()
 }
 
 /// The pictures of a folder in the order of bytes.

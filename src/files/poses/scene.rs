@@ -218,7 +218,7 @@ impl Frame {
         }
         let LoadedPicture { picture, mask, warnings } = match self.pixels {
             Pixels::Stored => {
-                let loaded = load_with(&self.image, options)?;
+                let mut loaded = load_with(&self.image, options)?;
                 let file = |file| masks::load(file, &probe(&self.image)?);
                 let mask = masks::both(loaded.mask, self.mask.as_deref().map(file).transpose()?);
                 LoadedPicture { mask: masks::checked(mask, &self.image)?, ..loaded }
@@ -271,6 +271,14 @@ pub struct LeftOut {
 /// A set of posed photographs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
+impl LeftOut {
+    /// A frame that cannot be loaded because of `error`.
+    pub fn of_frame(frame: &Frame, error: &Error) -> Self {
+        let name = frame.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        Self { entry: frame.entry, name, reason: error.reason() }
+    }
+}
+
     /// Name of the folder.
     pub name: String,
     /// At least one frame, in the pose file's order (COLMAP: by name).
@@ -316,6 +324,14 @@ impl Scene {
     /// Makes a scene of two photographs and their cameras. The cameras refer to the
     /// upright pixels ([`Pixels::Upright`]) and have the upright pictures' sizes.
     ///
+    /// Takes a frame that cannot be loaded, because of `error`, from the scene. The indices of those behind it fall by
+    /// one.
+    pub fn leave_out(&mut self, frame: usize, error: &Error) {
+        let frame = self.frames.remove(frame);
+        self.left_out.push(LeftOut::of_frame(&frame, error));
+        self.left_out.sort_by_key(|left| left.entry);
+    }
+
     /// # Errors
     /// A picture that is missing, malformed or of another size.
     pub fn from_pair(

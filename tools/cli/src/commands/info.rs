@@ -201,7 +201,8 @@ pub fn print_left_out(scene: &Scene) {
     if left.is_empty() {
         return;
     }
-    print_line(format!("left out of {} entries of the pose file: {}", scene.entries(), left.len()));
+    let entries = if scene.source.has_file() { "entries of the pose file" } else { "pictures" };
+    print_line(format!("left out of {} {entries}: {}", scene.entries(), left.len()));
     for one in left.iter().take(LEFT_OUT_MAX) {
         print_line(format!("  {:>3} {}: {}", one.entry, one.name, one.reason));
     }

@@ -18,6 +18,7 @@ mod export;
 pub mod frames;
 pub mod html;
 mod info;
+mod inputs;
 pub mod memory;
 pub mod model;
 mod output;

@@ -17,9 +17,9 @@ use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use subsplat::files::photos::folder::find_photographs;
-use subsplat::files::photos::image::{probe, save_depth_png, save_png};
+use subsplat::files::photos::image::{LoadOptions, probe, save_depth_png, save_png};
 use subsplat::files::poses::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::files::poses::scene::{Scene, has_scene, is_scene};
+use subsplat::files::poses::scene::{LeftOut, Scene, has_scene, is_scene};
 use subsplat::files::{SaveOptions, save_splats};
 use subsplat::network::config::Config;
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
@@ -203,6 +203,12 @@ pub struct Views<'a> {
     pub out: &'a Path,
     /// The scene of the frames.
     pub scene: &'a Scene,
+    /// Decoding of a frame's photograph.
+    pub load: LoadOptions,
+    /// The frames were named: each is needed.
+    pub named: bool,
+    /// Frames whose photographs cannot be read, and which are not drawn.
+    pub left_out: Vec<LeftOut>,
     /// Crop of a frame's photograph.
     pub crop: CropOptions,
     /// Rules to render.
@@ -237,28 +243,42 @@ impl Views<'_> {
         let stems = frames::file_stems(&names);
         let mut scored = Vec::with_capacity(views.len());
         for (view, (name, stem)) in views.iter().zip(names.into_iter().zip(stems)) {
-            scored.push(self.render_one(renderer, result, view, (name, stem))?);
             bar.inc(1);
+            let (camera, truth) = match view {
+                View::Path(camera) => (*camera, None),
+                View::Frame(i) => {
+                    let Some(cropped) = self.photograph(*i)? else { continue };
+                    (cropped.target_camera, Some((*i, cropped)))
+                }
+            };
+            scored.push(self.render_one(renderer, result, camera, truth, (name, stem))?);
         }
         Ok(scored)
+    }
+
+    /// The photograph of a frame; `None` for one that cannot be read and that nobody named.
+    fn photograph(&mut self, frame: usize) -> Result<Option<Cropped>> {
+        let frame = &self.scene.frames[frame];
+        match Photo::from_frame_with(frame, &self.load) {
+            Ok(photo) => Ok(Some(photo.crop(&self.crop)?)),
+            Err(subsplat::Error::Io(error)) if !self.named => {
+                let left = LeftOut::of_frame(frame, &error);
+                print_warning(format!("{} is not drawn: {}", left.name, left.reason));
+                self.left_out.push(left);
+                Ok(None)
+            }
+            Err(error) => Err(error.into()),
+        }
     }
 
     fn render_one(
         &mut self,
         renderer: &mut Renderer,
         result: &Reconstruction,
-        view: &View,
+        camera: Camera,
+        truth: Option<(usize, Cropped)>,
         (name, stem): (String, String),
     ) -> Result<Scored> {
-        let (camera, truth) = match view {
-            View::Path(camera) => (*camera, None),
-            View::Frame(i) => {
-                let cropped = Photo::from_frame(&self.scene.frames[*i])?.crop(&self.crop)?;
-                let enlarged = cropped.window.scale.min_element() < 1.0;
-                let truth = (cropped.target, cropped.target_mask);
-                (cropped.target_camera, Some((*i, truth, enlarged)))
-            }
-        };
         let picture = renderer.render(result.splats(), &camera, &self.options);
         renderer.take_warning().iter().for_each(print_warning);
         let (width, height) = (picture.width, picture.height);
@@ -279,8 +299,9 @@ impl Views<'_> {
             ssim: None,
             enlarged: false,
         };
-        if let Some((frame, (truth, mask), enlarged)) = truth {
-            let truth = truth.to_unit();
+        if let Some((frame, cropped)) = truth {
+            let enlarged = cropped.window.scale.min_element() < 1.0;
+            let (truth, mask) = (cropped.target.to_unit(), cropped.target_mask);
             scored.frame = Some(frame);
             // Masked pixels count as equal in the windows of SSIM.
             scored.psnr = Some(psnr_of_kept(&picture.rgb, &truth, (width, height), mask.as_ref())?);

@@ -69,6 +69,7 @@ pub fn load(
         let estimated = estimate(&input[0], &photographs, &options, bar)?;
         bar.suspend(|| print_estimate(&estimated));
         let doubtful = estimated.estimate.confidence == Confidence::Low;
+            strict: args.read.strict,
         return Ok(Loaded { scene: estimated.scene, doubtful });
     }
     let [one] = input else {
@@ -315,6 +316,8 @@ pub fn estimate(
          (give fisheye:DEGREES)"
     );
     let mut show = |i: usize| {
+    /// Refuse a photograph that would be left out.
+    pub strict: bool,
         bar.set_message(format!("photograph {} of {}", i + 1, photographs.len()));
         Ok(())
     };
@@ -338,6 +341,7 @@ pub fn print_estimate(estimated: &EstimatedScene) {
     print_line(format!(
         "the cameras of {placed} of {} photographs were estimated from {} shared points: {certain} \
          (error of rotations {}, of directions between cameras {}); the unit of length is the median \
+        strict: request.strict,
          distance of the points",
         estimate.cameras.len(),
         estimate.points.len(),

@@ -31,6 +31,7 @@ pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
         intrinsics: args.intrinsics.as_deref(),
         force: args.force,
         projection: args.lens.unwrap_or_default(),
+        strict: args.strict,
     };
     let estimated = progress
         .stage("cameras", |bar| pair::estimate(&args.input[0], &photographs, &request, bar))?;

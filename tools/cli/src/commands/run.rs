@@ -6,21 +6,19 @@ use super::curve::{self, Curve};
 use super::frames::{self, DepthSpread};
 use super::html::Page;
 use super::info::print_left_out;
+use super::inputs::{self, Inputs};
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
 use super::{browser, clip, memory, model, pair, render, video};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
-use anyhow::{Result, bail, ensure};
+use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use subsplat::cameras::estimation::move_along;
 use subsplat::files::SaveOptions;
-use subsplat::files::photos::image::{LoadOptions, Truncated};
-use subsplat::files::photos::notes::grouped;
-use subsplat::files::poses::scene::{Scene, SceneFormat};
+use subsplat::files::poses::scene::Scene;
 use subsplat::network::config::{Config, LowpassRef};
 use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
-use subsplat::reconstruct::inputs::pair::choose_photographs;
 use subsplat::reconstruct::is_mvsplat;
 use subsplat::reconstruct::stages::located;
 use subsplat::reconstruct::{Assessment, Backend, Trust};
@@ -46,6 +44,8 @@ const UNASKED_FRAMES: usize = 3;
 struct Plan {
     scene: Scene,
     context: Vec<usize>,
+    /// The photographs of `context`.
+    photos: Vec<Photo>,
     options: Options,
     /// The cameras are an estimate of low confidence.
     doubtful: bool,
@@ -93,7 +93,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let degree = model.config().primaries().sh_degree;
     output::check_formats(args, count, degree)?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
-    let photos = photographs(&plan.scene, &plan.context, args.source.pair.force, &mut progress)?;
+    let photos = std::mem::take(&mut plan.photos);
     let crop = CropOptions {
         target_size: Size::new(width, height),
         ..model.crop_options(Size::new(w, h))
@@ -108,6 +108,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut job = Views {
         out: &args.out,
         scene: &plan.scene,
+        load: inputs::load_options(args.source.pair.force),
+        named: !args.target.is_empty(),
+        left_out: Vec::new(),
         crop,
         options,
         motion: &args.motion,
@@ -142,6 +145,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut renderer = render::open(&args.rendering);
     let scored = progress
         .steps("rendering", views.len(), |bar| job.render(&mut renderer, &result, &views, bar))?;
+    let left_out = std::mem::take(&mut job.left_out);
     let bounds = result.depth_range();
     let near_far = NearFar::new(bounds.near, bounds.far);
     output::write_cameras(&args.out, &scored, &plan.scene, near_far)?;
@@ -151,6 +155,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let curve = curve.into_points();
     Done { model, result, options, scored, curve, assessment, files, video, clip }
         .finish(args, &plan, progress, answer)?;
+    plan.scene.left_out.extend(left_out);
     print_left_out(&plan.scene);
     Ok(())
 }
@@ -160,8 +165,9 @@ fn curve_of(args: &RunArgs, scene: &Scene, targets: &[usize], crop: &CropOptions
     let named = matches!(args.source.refine, Some(Refine::Steps(_) | Refine::Seconds(_)));
     let count = if named { targets.len().min(curve::PHOTOGRAPHS) } else { 0 };
     let frame = |i: usize| &scene.frames[targets[i * targets.len() / count]];
-    let view = |i: usize| Ok(Photo::from_frame(frame(i))?.crop(crop)?);
-    Ok(Curve::new((0..count).map(view).collect::<Result<_>>()?))
+    // The drawing of the views says which cannot be read.
+    let photos = (0..count).filter_map(|i| Photo::from_frame(frame(i)).ok());
+    Ok(Curve::new(photos.map(|photo| Ok(photo.crop(crop)?)).collect::<Result<_>>()?))
 }
 
 /// Describes the Gaussians of a scene that covers its inputs' pictures by `coverage`.
@@ -199,7 +205,8 @@ fn plan(args: &RunArgs, name: Option<String>, progress: &mut Progress) -> Result
         progress.stage("scene", |bar| pair::load(&args.input, &source.pair, &wanted, bar))?;
     scene.name = name.unwrap_or(scene.name);
     scene.warnings.iter().for_each(print_warning);
-    let (context, reason) = context(&args.source, &args.input[0], &scene)?;
+    let Inputs { context, reason, photos } =
+        inputs::choose(&args.source, &args.input[0], &mut scene, progress)?;
     print_line(format!(
         "{}: {} photographs ({}); the scene is made from {reason}",
         scene.name,
@@ -207,39 +214,7 @@ fn plan(args: &RunArgs, name: Option<String>, progress: &mut Progress) -> Result
         scene.source.name(),
     ));
     let options = reconstruct::options(&args.source, &scene, &context)?;
-    Ok(Plan { scene, context, options, doubtful })
-}
-
-/// Loads the photographs of a scene's `context` frames; `force` accepts truncated files. Prints the warnings about
-/// their files, where the estimation of cameras has not.
-pub fn photographs(
-    scene: &Scene,
-    context: &[usize],
-    force: bool,
-    progress: &mut Progress,
-) -> Result<Vec<Photo>> {
-    let options = load_options(force);
-    let mut warnings: Vec<(&Path, Vec<String>)> = Vec::new();
-    let photos = progress.steps("photographs", context.len(), |bar| {
-        let photo = |&i: &usize| {
-            bar.inc(1);
-            let frame = &scene.frames[i];
-            let mut loaded = frame.load_with(&options)?;
-            warnings.push((frame.image.as_path(), std::mem::take(&mut loaded.warnings)));
-            Ok(Photo::from_loaded(loaded))
-        };
-        context.iter().map(photo).collect::<Result<_>>()
-    })?;
-    if scene.source != SceneFormat::Photographs {
-        let lines = warnings.iter().map(|(path, lines)| (*path, lines.as_slice()));
-        grouped(lines).iter().for_each(print_warning);
-    }
-    Ok(photos)
-}
-
-/// Options of the decoding; `force` accepts truncated files.
-fn load_options(force: bool) -> LoadOptions {
-    LoadOptions { truncated: if force { Truncated::Accept } else { Truncated::Refuse } }
+    Ok(Plan { scene, context, photos, options, doubtful })
 }
 
 /// Locates the frames `targets` among the photographs of the scene where the cameras of these were adjusted: those of
@@ -263,19 +238,24 @@ fn follow_adjustment(
     let adjusted: Vec<Camera> = result.inputs().iter().map(|c| c.input_camera).collect();
     let given = cameras(&targets);
     let mut moved = move_along(&cameras(&plan.context), &adjusted, &given).unwrap_or(given);
-    let options = load_options(force);
-    let posed = |of: &[usize], cameras: &[Camera]| {
-        let photo = |(&i, to): (&usize, &Camera)| {
-            let photo = Photo::from_frame_with(&frames[i], &options)?;
-            photo.with_camera(photo.camera().with_pose_unchecked(to.world_from_camera()))
-        };
-        of.iter().zip(cameras).map(photo).collect::<subsplat::Result<Vec<_>>>()
+    let options = inputs::load_options(force);
+    let posed = |(&i, to): (&usize, &Camera)| {
+        let photo = Photo::from_frame_with(&frames[i], &options)?;
+        photo.with_camera(photo.camera().with_pose_unchecked(to.world_from_camera()))
     };
-    let inputs = posed(&plan.context, &adjusted)?;
+    let inputs = plan.context.iter().zip(&adjusted).map(posed);
+    let inputs = inputs.collect::<subsplat::Result<Vec<_>>>()?;
     for (targets, moved) in targets.chunks(TOGETHER).zip(moved.chunks_mut(TOGETHER)) {
-        let photos = posed(targets, moved)?;
+        // One that cannot be read is left out of the views.
+        let photos = targets.iter().zip(moved).filter_map(|(i, moved)| {
+            let photo = posed((i, moved)).ok()?;
+            Some((photo, moved))
+        });
+        let (photos, moved): (Vec<Photo>, Vec<&mut Camera>) = photos.unzip();
         let found = progress.stage("cameras", |_| located(&inputs, &photos))?;
-        moved.iter_mut().zip(found).for_each(|(moved, found)| *moved = found.unwrap_or(*moved));
+        for (moved, found) in moved.into_iter().zip(found) {
+            *moved = found.unwrap_or(*moved);
+        }
     }
     for (i, to) in targets.iter().zip(&moved) {
         let camera = &mut plan.scene.frames[*i].camera;
@@ -283,63 +263,6 @@ fn follow_adjustment(
     }
     print_line("the photographs to compare with were located among the adjusted cameras");
     Ok(())
-}
-
-/// Chooses the context frames of the scene at `input`: those that `args` name, or a default. Returns
-/// the reason for the choice too.
-pub fn context(args: &SourceArgs, input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
-    let (named, most) = (&args.context, args.photographs_max());
-    let entry = |&i: &usize| scene.frames[i].entry.to_string();
-    let list = |frames: &[usize]| frames.iter().map(entry).collect::<Vec<_>>().join(",");
-    if !named.is_empty() {
-        let chosen = frames::indices(scene, named, "--context")?;
-        ensure!(
-            chosen.len() >= 2,
-            "--context: expected at least 2 photographs, got {}",
-            chosen.len()
-        );
-        for (n, i) in chosen.iter().enumerate() {
-            let name = &scene.frames[*i].name;
-            ensure!(
-                !chosen[..n].contains(i),
-                "--context: expected different photographs, got {name} twice"
-            );
-        }
-        let text = format!("{}, as given", named.join(","));
-        return Ok((chosen, text));
-    }
-    if scene.frames.len() == 2 {
-        return Ok((vec![0, 1], "both".to_owned()));
-    }
-    if let Some(test) = frames::protocol(input, scene)?.into_iter().next()
-        && test.context.len() >= 2
-    {
-        let text = format!("{}, as protocol.json says", list(&test.context));
-        return Ok((test.context, text));
-    }
-    let count = scene.frames.len();
-    if scene.source == SceneFormat::Photographs && count <= most {
-        let all: Vec<usize> = (0..count).collect();
-        return Ok((all, "all of them".to_owned()));
-    }
-    let Some(chosen) = choose_photographs(scene, most) else {
-        bail!(
-            "{}: expected two photographs taken from different places, got {} from one place",
-            scene.name,
-            scene.frames.len()
-        )
-    };
-    let text = if chosen.len() == count {
-        "all of them".to_owned()
-    } else {
-        let from = format!("{} of them ({})", chosen.len(), list(&chosen));
-        if chosen.len() < most {
-            format!("{from}: the others show other places")
-        } else {
-            format!("{from}, which overlap; --context names others")
-        }
-    };
-    Ok((chosen, text))
 }
 
 /// Frames to render as pictures of `size`; empty for a path.
@@ -350,7 +273,11 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
     let chosen = if args.target.is_empty() {
         default_targets(&args.input[0], plan, size)?
     } else {
-        frames::indices(&plan.scene, &args.target, "--target")?
+        let named = frames::indices(&plan.scene, &args.target, "--target")?;
+        // An error before the work: these are needed.
+        let load = inputs::load_options(args.source.pair.force);
+        named.iter().try_for_each(|&i| plan.scene.frames[i].load_with(&load).map(|_| ()))?;
+        named
     };
     if chosen.is_empty() {
         print_line(format!(

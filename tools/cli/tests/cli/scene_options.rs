@@ -6,6 +6,7 @@ use glam::{Mat4, Vec3};
 use program::{call_in, workplace};
 use serde_json::Value;
 use std::path::Path;
+use subsplat::image::{GrayImage, Luma};
 
 #[test]
 fn models_pictures_and_axes_are_chosen() {
@@ -154,4 +155,53 @@ fn what_is_left_out_is_listed() {
     let refused = call_in(place.path(), "render two.ply -o pictures --size 16 --strict");
     assert_eq!(refused.code, 1);
     assert!(refused.error().contains("1 of 2 splats"), "{}", refused.error());
+}
+
+/// A photograph that is masked as a whole is left out where others remain, and is an error where it is needed.
+#[test]
+fn a_photograph_without_pixels_is_left_out() {
+    let place = workplace();
+    let mask = |i: usize, value: u8| {
+        std::fs::create_dir_all(place.path().join("scene/masks")).unwrap();
+        let file = place.path().join(format!("scene/masks/view{i}.png"));
+        GrayImage::from_pixel(8, 8, Luma([value])).save(file).unwrap();
+    };
+    (0..3).for_each(|i| mask(i, 255));
+    let run = |more: &str| {
+        let call = format!("run scene -o out --save ply --refine off --fit 0 --size 64 {more}");
+        call_in(place.path(), &call)
+    };
+    // It is a view to compare with.
+    mask(1, 0);
+    let called = run("--input-size 64 --context 0,2");
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    assert!(
+        called.stderr.contains("warning: view1.png is not drawn: expected"),
+        "{}",
+        called.stderr
+    );
+    let list = "left out of 3 entries of the pose file: 1\n    1 view1.png: expected";
+    assert!(called.stderr.contains(list), "{}", called.stderr);
+    let called = run("--input-size 64 --context 0,2 --target 1");
+    assert!(called.code == 1 && called.error().contains("view1.png: expected"));
+    assert!(!called.stderr.contains("the scene lies at"), "{}", called.stderr);
+    // It is one of those that the scene would be made from.
+    mask(1, 255);
+    mask(2, 0);
+    let called = run("--input-size 64");
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let list = "left out of 3 entries of the pose file: 1\n    2 view2.png: expected";
+    assert!(called.stderr.contains(list), "{}", called.stderr);
+    assert!(called.stderr.contains("2 photographs (cameras.json)"), "{}", called.stderr);
+    for needed in ["--strict", "--context 0,2"] {
+        let called = run(needed);
+        assert!(called.code == 1 && called.error().contains("view2.png: expected"), "{needed}");
+    }
+    mask(0, 0);
+    let called = run("");
+    assert!(
+        called.code == 1 && called.error().contains("view0.png: expected"),
+        "{}",
+        called.stderr
+    );
 }

@@ -3,6 +3,7 @@
 
 use crate::commands::args::view::ViewArgs;
 use crate::commands::frames::DepthSpread;
+use crate::commands::inputs::{self, Inputs};
 use crate::commands::memory::{self, Planned};
 use crate::commands::reconstruct::{self, reconstruct};
 use crate::commands::{model, pair, render, run, whole};
@@ -120,11 +121,12 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
 fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     ensure!(args.cameras.is_none(), "--cameras: only with a finished scene");
     let wanted = [("--context", args.source.context.as_slice())];
-    let pair::Loaded { scene, .. } =
+    let pair::Loaded { mut scene, .. } =
         progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, &wanted, bar))?;
     scene.warnings.iter().for_each(print_warning);
     let first = args.input.first().context("no input")?;
-    let (context, reason) = run::context(&args.source, first, &scene)?;
+    let Inputs { context, reason, photos } =
+        inputs::choose(&args.source, first, &mut scene, progress)?;
     print_line(format!(
         "{}: {} photographs; the scene is made from {reason}",
         scene.name,
@@ -142,7 +144,6 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
         None => std::mem::replace(&mut options.refine, Refine::Off),
         Some(_) => Refine::Off,
     };
-    let photos = run::photographs(&scene, &context, args.source.pair.force, progress)?;
     let result = reconstruct(&model, photos.as_slice(), &options, progress, &mut |_| Ok(()))?;
     // Later calls use the depth range of this check.
     let prior = result.initial_depth_range().clone();
