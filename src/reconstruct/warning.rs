@@ -140,8 +140,13 @@ impl fmt::Display for Warning {
             Self::Masked { photographs, share } => write!(
                 f,
                 "masks leave out {:.0} % of the pixels of {photographs} photographs (what is black in a mask file, or \
-                 transparent, is left out)",
-                100.0 * share
+                 transparent, is left out){}",
+                100.0 * share,
+                if *share > 0.5 {
+                    ": more than half; if it is the other part that should go, exchange black and white in the masks"
+                } else {
+                    ""
+                }
             ),
             Self::PhotographEnlarged { size, resized } => write!(
                 f,

@@ -4,8 +4,16 @@
 //! photographs, `images` or a reduced copy as `images_4`, or in it: `masks/NAME.jpg.png` (COLMAP) or
 //! `masks/NAME.png`. The folder may be called `mask` or `masks_2` too ([`FOLDERS`]). Without one there, a mask lies
 //! beside its photograph: `NAME_mask.png` (`variants.rs`). A mask belongs to the stored
-//! pixels, as COLMAP and nerfstudio have it; one of the shape of the upright pixels alone belongs to those. A JPEG has
-//! noise, so its values below 128 are masked.
+//! pixels, as COLMAP and nerfstudio have it; one of the shape of the upright pixels alone belongs to those.
+//!
+//! Values, by one rule ([`Values::of`]); the second and the third case give a line:
+//!
+//! | values of the file | masked |
+//! |---|---|
+//! | black and white with soft edges, a JPEG with noise, 0 and 1 | below half |
+//! | labels, in a lossless file: none above 32, or 3 to 32 different ones | 0 |
+//! | other greys: on both sides of 128 | below 128 |
+//! | other greys: on one side of 128, with a contrast of 32 at least | below the middle of their range |
 //!
 //! A mask in an alpha channel is read with its picture (`decode.rs`).
 
@@ -27,8 +35,15 @@ const FOLDERS: [&str; 10] = [
 /// Largest relative difference of aspect between a mask and its photograph: reduced copies have sides rounded to whole
 /// pixels.
 const ASPECT: f64 = 0.02;
-/// Least value of a kept pixel in a lossless file, and in a JPEG.
-const KEPT: [u8; 2] = [1, 128];
+/// Least value of a kept pixel in a mask of black and white.
+const HALF: u8 = 128;
+/// Highest label of a picture of few classes, and most different labels of another one.
+const LABELS: (u8, usize) = (32, 32);
+/// Largest distance of a value from black or white, in a JPEG, and least share of such pixels in a mask of black and
+/// white: the others are soft edges.
+const TWO_VALUES: (u8, f64) = (32, 0.9);
+/// Least contrast of greys that are divided in the middle of their range.
+const CONTRAST: u8 = 32;
 
 /// Mask file of a photograph by the names of the folders, whether it exists or not; that beside it, or `None`, where
 /// there is no folder of masks.
@@ -77,16 +92,19 @@ pub(in crate::files) fn check(path: &Path, photograph: &Probe) -> Result<()> {
     placement([mask.width, mask.height], photograph, path).map(|_| ())
 }
 
-/// Reads a mask of the stored pixels of a photograph, at their size.
+/// Reads a mask of the stored pixels of a photograph, at their size, with a line about values that are neither black
+/// nor white.
 ///
 /// # Errors
 /// Those of [`check`]; a file that cannot be decoded.
-pub(in crate::files) fn load(path: &Path, photograph: &Probe) -> Result<Mask> {
+pub(in crate::files) fn load(path: &Path, photograph: &Probe) -> Result<(Mask, Option<String>)> {
     let bytes = read(path)?;
     let decoded = decode(&bytes, &LoadOptions::default(), path)?;
-    let least = KEPT[usize::from(jpeg::is_jpeg(&bytes))];
     let picture = decoded.picture;
-    let kept = picture.data.chunks_exact(3).map(|p| p.iter().any(|v| *v >= least)).collect();
+    let values = picture.data.chunks_exact(3).map(|p| p.iter().copied().max().unwrap_or(0));
+    let values: Vec<u8> = values.collect();
+    let of = Values::of(&values, !jpeg::is_jpeg(&bytes));
+    let kept = values.iter().map(|value| *value >= of.least).collect();
     let invalid = || Error::format(path, "a mask with pixels", "none");
     let mask = Mask::new(picture.width, picture.height, kept).ok_or_else(invalid)?;
     // Programs that cut out write white with an alpha.
@@ -95,7 +113,57 @@ pub(in crate::files) fn load(path: &Path, photograph: &Probe) -> Result<Mask> {
         Placement::Stored => mask,
         Placement::Upright(back) => oriented(&mask, back).ok_or_else(invalid)?,
     };
-    Ok(mask.nearest(photograph.width, photograph.height))
+    Ok((mask.nearest(photograph.width, photograph.height), of.line))
+}
+
+/// Meaning of the values of a mask file.
+struct Values {
+    /// Least value of a kept pixel.
+    least: u8,
+    /// A line about values that are neither black nor white.
+    line: Option<String>,
+}
+
+impl Values {
+    fn of(values: &[u8], lossless: bool) -> Self {
+        let mut counts = [0_usize; 256];
+        values.iter().for_each(|value| counts[usize::from(*value)] += 1);
+        let used: Vec<u8> = (0..=u8::MAX).filter(|value| counts[usize::from(*value)] > 0).collect();
+        let (low, high) = (used.first().copied().unwrap_or(0), used.last().copied().unwrap_or(0));
+        let near = if lossless { 0 } else { TWO_VALUES.0 };
+        let ends = used.iter().filter(|value| **value <= near || **value >= u8::MAX - near);
+        let extreme: usize = ends.map(|value| counts[usize::from(*value)]).sum();
+        let (highest, most) = LABELS;
+        if high <= 1 {
+            return Self { least: 1, line: None };
+        }
+        if extreme as f64 >= TWO_VALUES.1 * values.len() as f64 {
+            return Self { least: HALF, line: None };
+        }
+        if lossless && (high <= highest || used.len() == 1 || (3..=most).contains(&used.len())) {
+            let few: Vec<String> = used.iter().take(4).map(u8::to_string).collect();
+            let more = if used.len() > few.len() { ", …" } else { "" };
+            let masked = if low == 0 {
+                "what is 0 is left out, and all else is used"
+            } else {
+                "what is 0 would be left out, and none is: make it 0 to leave it out"
+            };
+            let line = format!(
+                "its mask has the values {}{more}, which are read as labels: {masked}",
+                few.join(", ")
+            );
+            return Self { least: 1, line: Some(line) };
+        }
+        let one_side = low >= HALF || high < HALF;
+        let least = match (one_side, high - low >= CONTRAST) {
+            (true, true) => low.midpoint(high) + 1,
+            _ => HALF,
+        };
+        let line = format!(
+            "its mask has greys from {low} to {high} that are neither black nor white: what is below {least} is left out"
+        );
+        Self { least, line: Some(line) }
+    }
 }
 
 /// Pixels to which a mask belongs.
@@ -336,6 +404,58 @@ mod tests {
     }
 
     #[test]
+    fn values_of_a_mask_have_one_rule() {
+        let of = |parts: &[(u8, usize)], lossless: bool| {
+            let values: Vec<u8> = parts.iter().flat_map(|(v, n)| vec![*v; *n]).collect();
+            let Values { least, line } = Values::of(&values, lossless);
+            (least, line.unwrap_or_default())
+        };
+        let silent = |least: u8| (least, String::new());
+        // Black and white, with soft edges, with the noise of a JPEG, and of one value.
+        assert_eq!(of(&[(0, 50), (255, 50)], true), silent(128));
+        assert_eq!(of(&[(0, 50), (90, 5), (200, 5), (255, 40)], true), silent(128));
+        assert_eq!(of(&[(0, 30), (7, 20), (240, 40), (100, 9)], false), silent(128));
+        assert_eq!((of(&[(255, 9)], true), of(&[(0, 9)], true)), (silent(128), silent(1)));
+        assert_eq!(of(&[(0, 5), (1, 5)], true), silent(1));
+        // Labels: few classes, many of which some are high, and without 0.
+        for labels in [vec![(0, 5), (2, 5)], vec![(0, 5), (11, 9), (140, 9), (255, 3)]] {
+            let (least, line) = of(&labels, true);
+            assert!(least == 1 && line.contains("labels: what is 0 is left out"), "{line}");
+        }
+        let (least, line) = of(&[(3, 5), (17, 5)], true);
+        assert!(least == 1 && line.contains("values 3, 17,") && line.contains("and none is"));
+        // Two greys, and greys on both sides of the middle.
+        let (least, line) = of(&[(60, 5), (120, 5)], true);
+        assert!(least == 91 && line.contains("from 60 to 120") && line.contains("below 91"));
+        assert_eq!(of(&[(140, 5), (254, 5)], true).0, 198);
+        assert_eq!(of(&[(140, 5), (150, 5)], true).0, 128);
+        assert_eq!(of(&[(0, 5), (100, 5)], true).0, 51);
+        let soft: Vec<(u8, usize)> = (0..=250).map(|v| (v, 1)).collect();
+        assert_eq!(of(&soft, true).0, 128);
+        assert_eq!(of(&soft[..90], false).0, 45);
+    }
+
+    #[test]
+    fn labels_and_a_missing_mask_give_lines() {
+        let folder = tempfile::tempdir().unwrap();
+        let folder = folder.path();
+        scene(folder, "");
+        save_mask(&folder.join("images/a_mask.png"), [8, 6], |x, y| 3 * u8::from(left(x, y)));
+        let one = scene(folder, "");
+        assert_eq!(one.warnings.len(), 1, "{:?}", one.warnings);
+        let start =
+            "1 of 2 frames have no mask, as the others have: all of their pixels are used: ";
+        assert_eq!(one.warnings[0], format!("{start}images/b.png"));
+        let loaded = one.frames[0].load_with(&LoadOptions::default()).unwrap();
+        assert_eq!(loaded.mask, Some(expected()));
+        assert_eq!(loaded.warnings.len(), 1, "{:?}", loaded.warnings);
+        assert!(loaded.warnings[0].contains("a.png: its mask has the values 0, 3, which"));
+        let path = folder.join("images/a.png");
+        let warnings = photograph(&path).warnings;
+        assert!(warnings.len() == 1 && warnings[0].contains("labels"), "{warnings:?}");
+    }
+
+    #[test]
     fn a_mask_turns_with_its_photograph() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mask.png");
@@ -344,7 +464,7 @@ mod tests {
             let turned = (orientation > 1).then_some(orientation);
             let probe = Probe { width: 8, height: 6, orientation: turned };
             save_mask(&path, [8, 6], grey);
-            let stored = load(&path, &probe).unwrap();
+            let stored = load(&path, &probe).unwrap().0;
             assert_eq!(stored, expected(), "{orientation}");
             let upright = oriented(&stored, turn).unwrap();
             let size = probe.upright();
@@ -355,7 +475,7 @@ mod tests {
             // A mask of the upright pixels has another shape.
             let value = |x: u32, y: u32| u8::from(upright.kept()[(y * 6 + x) as usize]);
             save_mask(&path, [6, 8], value);
-            assert_eq!(load(&path, &probe).unwrap(), expected(), "{orientation}");
+            assert_eq!(load(&path, &probe).unwrap().0, expected(), "{orientation}");
         }
         // The photograph's own rotation.
         let picture = Rgb {

@@ -203,7 +203,10 @@ fn decode_upright(
     warnings.extend(report.warnings);
     let probe = Probe { width, height, orientation };
     let mask = match mask_file.map(|file| masks::load(file, &probe)) {
-        Some(Ok(mask)) => masks::both(decoded.mask, Some(mask)),
+        Some(Ok((mask, line))) => {
+            warnings.extend(line.map(|line| format!("{}: {line}", path.display())));
+            masks::both(decoded.mask, Some(mask))
+        }
         Some(Err(error)) => {
             warnings.push(format!("{}: all of its pixels are used: {error}", path.display()));
             decoded.mask

@@ -53,6 +53,8 @@ const SAME_VIEW: f64 = 0.85;
 const GREY: (u8, f64) = (12, 0.99);
 /// Distance of a mask's values from black or white, and least share of such pixels.
 const TWO_VALUES: (u8, f64) = (32, 0.95);
+/// Most values of a mask that is neither black nor white, such as labels.
+const VALUES_MAX: usize = 32;
 /// Mean red, green and blue of a map of normals that face the camera, and the largest difference from them.
 const NORMALS: ([f64; 3], f64) = ([128.0, 128.0, 220.0], 45.0);
 /// Most colours of a map of labels.
@@ -194,6 +196,12 @@ fn has_two_values(picture: &Rgb) -> bool {
     is_grey(picture) && share(picture, |p| p[1] <= near || p[1] >= u8::MAX - near) >= least
 }
 
+/// Returns whether a grey picture has as few values as masks and labels have: photographs have all of them.
+fn has_few_values(picture: &Rgb) -> bool {
+    let values: HashSet<u8> = picture.data.iter().copied().collect();
+    values.len() <= VALUES_MAX
+}
+
 fn has_few_colours(picture: &Rgb) -> bool {
     let mut colours = HashSet::new();
     let within = |pixel| {
@@ -259,7 +267,8 @@ pub(super) fn mask_beside(image: &Path) -> Option<PathBuf> {
         .iter()
         .flat_map(|stem| MASK_EXTENSIONS.map(|extension| format!("{stem}.{extension}")));
     let is_mask = |path: &PathBuf| {
-        path != image && path.is_file() && load(path).is_ok_and(|mask| has_two_values(&mask))
+        let is_one = |mask: &Rgb| has_two_values(mask) || is_grey(mask) && has_few_values(mask);
+        path != image && path.is_file() && load(path).is_ok_and(|mask| is_one(&mask))
     };
     names.map(|name| image.with_file_name(name)).find(is_mask)
 }

@@ -307,8 +307,11 @@ pub(super) fn assemble(
     let probes: Vec<Option<Result<Probe>>> = drafts.par_iter().map(probe).collect();
     let entries = panoramas::expanded(path, drafts.into_iter().zip(probes).collect());
     let count = entries.len();
+    let files: Vec<String> = entries.iter().map(|(draft, _)| draft.file.clone()).collect();
     let mut notes = Notes::default();
     let mut frames: Vec<Frame> = Vec::with_capacity(count);
+    // A pose file may have masks of some of its frames alone.
+    let named_masks = entries.iter().any(|(draft, _)| draft.mask.is_some());
     for (entry, (mut draft, stored)) in entries.into_iter().enumerate() {
         let file = draft.file.clone();
         let made = match (draft.refused.take(), stored) {
@@ -336,6 +339,11 @@ pub(super) fn assemble(
     }
     if strict && let Some(error) = notes.strict_error(path, count) {
         return Err(error);
+    }
+    if !named_masks && frames.iter().any(|frame| frame.mask.is_some()) {
+        let without = frames.iter().filter(|frame| frame.mask.is_none() && frame.cut.is_none());
+        let files = without.map(|frame| files[frame.entry].clone());
+        notes.without_mask = files.filter(|file| !notes.unmasked.contains(file)).collect();
     }
     if source == SceneFormat::Photographs {
         // The photographs' loader has said so.

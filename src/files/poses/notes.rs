@@ -27,6 +27,8 @@ pub(super) struct Notes {
     pub skewed: Vec<String>,
     /// Pictures whose mask is not used.
     pub unmasked: Vec<String>,
+    /// Pictures without a mask, where others have one.
+    pub without_mask: Vec<String>,
 }
 
 impl Notes {
@@ -88,6 +90,7 @@ impl Notes {
                 "have a mask that is missing, cannot be read or has another shape: all of their \
                  pixels are used",
             ),
+            (&self.without_mask, "have no mask, as the others have: all of their pixels are used"),
         ];
         let line = |(files, what): (&Vec<String>, &str)| {
             let few: Vec<&str> = files.iter().take(3).map(String::as_str).collect();

@@ -220,7 +220,10 @@ impl Frame {
             Pixels::Stored => {
                 let mut loaded = load_with(&self.image, options)?;
                 let file = |file| masks::load(file, &probe(&self.image)?);
-                let mask = masks::both(loaded.mask, self.mask.as_deref().map(file).transpose()?);
+                let (file, line) = self.mask.as_deref().map(file).transpose()?.unzip();
+                let line = line.flatten().map(|line| format!("{}: {line}", self.image.display()));
+                loaded.warnings.extend(line);
+                let mask = masks::both(loaded.mask, file);
                 LoadedPicture { mask: masks::checked(mask, &self.image)?, ..loaded }
             }
             Pixels::Upright => {
@@ -268,9 +271,6 @@ pub struct LeftOut {
     pub reason: String,
 }
 
-/// A set of posed photographs.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Scene {
 impl LeftOut {
     /// A frame that cannot be loaded because of `error`.
     pub fn of_frame(frame: &Frame, error: &Error) -> Self {
@@ -279,6 +279,9 @@ impl LeftOut {
     }
 }
 
+/// A set of posed photographs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
     /// Name of the folder.
     pub name: String,
     /// At least one frame, in the pose file's order (COLMAP: by name).
@@ -321,9 +324,6 @@ impl Scene {
         self.frames.iter().position(|frame| frame.entry == entry)
     }
 
-    /// Makes a scene of two photographs and their cameras. The cameras refer to the
-    /// upright pixels ([`Pixels::Upright`]) and have the upright pictures' sizes.
-    ///
     /// Takes a frame that cannot be loaded, because of `error`, from the scene. The indices of those behind it fall by
     /// one.
     pub fn leave_out(&mut self, frame: usize, error: &Error) {
@@ -332,6 +332,9 @@ impl Scene {
         self.left_out.sort_by_key(|left| left.entry);
     }
 
+    /// Makes a scene of two photographs and their cameras. The cameras refer to the
+    /// upright pixels ([`Pixels::Upright`]) and have the upright pictures' sizes.
+    ///
     /// # Errors
     /// A picture that is missing, malformed or of another size.
     pub fn from_pair(
