@@ -17,6 +17,7 @@ use super::{converted, heic, icc, jpeg, jxl, pages, ranges, raw, reduced};
 use crate::files::{Error, Result, open_regular, read};
 use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
+use image::error::UnsupportedErrorKind;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use std::borrow::Cow;
@@ -90,8 +91,25 @@ pub(super) struct Opened<'a> {
 pub(super) fn refused(path: &Path, error: image::ImageError) -> Error {
     match error {
         image::ImageError::IoError(e) if e.raw_os_error().is_some() => Error::io(path, e),
+        image::ImageError::Unsupported(e) => {
+            let got = match e.kind() {
+                UnsupportedErrorKind::Color(_) => format!(
+                    "pixels of a kind that is not read, such as grey in floating point; convert the picture to 8 or \
+                     16 bits, grey or RGB ({e})"
+                ),
+                UnsupportedErrorKind::Format(_) if is_gif(path) => {
+                    "a GIF; a moving one is read as a clip where it is given alone".to_owned()
+                }
+                _ => e.to_string(),
+            };
+            Error::format(path, FORMATS, got)
+        }
         e => Error::format(path, FORMATS, e.to_string()),
     }
+}
+
+fn is_gif(path: &Path) -> bool {
+    crate::files::first_bytes(path, 4).is_ok_and(|start| start == *b"GIF8")
 }
 
 /// Checks the size of a picture before anything is allocated.

@@ -7,7 +7,7 @@
 //! | floating point | 1; 255 or 65535 where a sample exceeds 16 and none exceeds this value |
 //!
 //! Samples are sRGB, or what the ICC profile says, whatever their type. Those outside the range are clipped. Each
-//! case but 8 bits and 65535 gives a line. Cameras and converters store 10 and 12 bits in 16 without scaling
+//! case but 8 bits and 65535 gives a line, as do 16-bit samples of almost no contrast. Cameras and converters store 10 and 12 bits in 16 without scaling
 //! them, and arrays of floats are saved in levels of 8 or 16 bits.
 
 use super::tiff_tags::{MAX_SAMPLE_VALUE, numbers};
@@ -17,6 +17,8 @@ use image::DynamicImage;
 const RANGES: [u16; 3] = [255, 1023, 4095];
 /// Greatest floating-point sample that may be a highlight above white.
 const HIGHLIGHT: f32 = 16.0;
+/// Least range of 16-bit samples, of 65,535: 8 levels of 255. Thermal cameras store temperatures in fewer.
+const LEAST_RANGE: u16 = 2056;
 
 /// Brings the samples of a file to the full range of their type. Returns the line about it.
 pub(super) fn to_full_range(pixels: &mut DynamicImage, file: &[u8]) -> Option<String> {
@@ -46,11 +48,11 @@ fn sixteen(samples: &mut [u16], channels: usize, colors: usize, file: &[u8]) -> 
         Some(white) => (white, "as the file states"),
         None if has_sbit(file) => return None,
         None => {
-            let white = RANGES.into_iter().find(|white| brightest <= *white)?;
-            if brightest <= white / 2 {
-                return None;
+            let white = RANGES.into_iter().find(|white| brightest <= *white);
+            match white.filter(|white| brightest > white / 2) {
+                Some(white) => (white, "as no sample exceeds it"),
+                None => return little_contrast(samples, channels, colors, brightest),
             }
-            (white, "as no sample exceeds it")
         }
     };
     let scale = |v: u16| {
@@ -67,6 +69,23 @@ fn sixteen(samples: &mut [u16], channels: usize, colors: usize, file: &[u8]) -> 
         "samples of 16 bits are read with the white of {} bits, {white}, {reason}",
         white.count_ones()
     ))
+}
+
+/// A line about samples that differ by less than [`LEAST_RANGE`], as those of thermal cameras do.
+fn little_contrast(
+    samples: &[u16],
+    channels: usize,
+    colors: usize,
+    brightest: u16,
+) -> Option<String> {
+    let of_colors = samples.chunks_exact(channels).flat_map(|pixel| &pixel[..colors]);
+    let darkest = of_colors.copied().min()?;
+    (brightest > darkest && brightest - darkest < LEAST_RANGE).then(|| {
+        format!(
+            "samples of 16 bits lie between {darkest} and {brightest} alone, so that the picture has almost no \
+             contrast (a thermal picture?): spread this range from black to white, the same for all pictures"
+        )
+    })
 }
 
 /// Returns whether a PNG states its significant bits: its samples are then scaled to 16 bits (PNG, 11.3.2.7).
@@ -143,8 +162,15 @@ mod tests {
         }
         // The full range, and a picture that is dark for each of the others.
         for brightest in [65_535, 4096, 2047, 500, 127, 0] {
-            assert_eq!(deep(&[0, brightest], b""), (vec![0, brightest], None), "{brightest}");
+            let (found, line) = deep(&[0, brightest], b"");
+            assert_eq!(found, [0, brightest]);
+            let little = line.is_some_and(|line| line.contains("almost no contrast"));
+            assert_eq!(little, (1..2056).contains(&brightest), "{brightest}");
         }
+        // A thermal picture.
+        let (found, line) = deep(&[29_000, 30_500], b"");
+        assert!(found == [29_000, 30_500] && line.unwrap().contains("between 29000 and 30500"));
+        assert_eq!(deep(&[29_000, 31_056], b"").1, None);
     }
 
     #[test]

@@ -122,6 +122,19 @@ impl PoseFile {
         }
     }
 
+    /// The path of the source as seen from `folder`, which [`SceneOptions::model`](super::reading::SceneOptions::model)
+    /// reads again.
+    fn name(&self, folder: &Path) -> String {
+        let path = match self {
+            Self::Matrices(path) => path.join("poses.txt"),
+            Self::ScannerApp(path) => scanner_app::first(path).unwrap_or_else(|| path.clone()),
+            Self::MatrixFiles(path) => matrix_files::first(path).unwrap_or_else(|| path.clone()),
+            Self::Polycam(path) if path.join("keyframes").is_dir() => path.join("keyframes"),
+            other => other.path().to_owned(),
+        };
+        name(folder, &path)
+    }
+
     /// The file, or the folder of several.
     pub fn path(&self) -> &Path {
         match self {
@@ -450,7 +463,7 @@ fn chosen(
     worth_a_line: impl Fn(&Candidate) -> bool,
 ) -> Found {
     let named = |other: &Candidate| {
-        let name = name(folder, other.file.path());
+        let name = other.file.name(folder);
         match other.file.cameras() {
             0 => name,
             cameras => format!("{name} ({cameras} cameras)"),
@@ -458,7 +471,7 @@ fn chosen(
     };
     let source = |candidate: Candidate| {
         let file = candidate.file;
-        Source { name: name(folder, file.path()), file }
+        Source { name: file.name(folder), file }
     };
     let lines: Vec<String> = others.iter().filter(|other| worth_a_line(other)).map(named).collect();
     let file = source(first);

@@ -140,6 +140,7 @@ fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
     match (name.as_str(), extension.as_str()) {
         (_, "json") | ("metadata", "") => match find::foreign_json(path) {
             Some(file) => load_found(&file, reading),
+            None if scanner_app::is_frame(path) => scanner_app::load(folder, reading),
             None => load_json(path, reading),
         },
         (_, "npy") => llff::load(path, reading),
@@ -152,8 +153,10 @@ fn load_file(path: &Path, reading: &Reading<'_>) -> Result<Scene> {
         (_, "bin") => colmap::load(folder, reading),
         ("poses.txt" | "k.txt", _) => matrices::load_with(folder, reading),
         (name, "txt") if name.ends_with(mvsnet::ENDING) => mvsnet::load(folder, reading),
-        (name, "txt") if name.ends_with(matrix_files::POSE) => matrix_files::load(folder, reading),
-        (_, "txt") => re10k::load(path, reading),
+        (_, "txt") => match matrix_files::scene_of(path) {
+            Some(scene) => matrix_files::load(scene, reading),
+            None => re10k::load(path, reading),
+        },
         _ => Err(Error::format(
             path,
             "a folder or a pose file (.json, .txt, .bin, .npy, .npz, .out, .xml, .csv, .sfm)",

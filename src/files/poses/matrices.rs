@@ -13,6 +13,9 @@ use crate::files::{Error, Result, read};
 use glam::{DMat4, DVec4};
 use std::path::Path;
 
+/// Calibration of KITTI's odometry.
+const KITTI: &str = "calib.txt";
+
 /// Direction and axes of a pose matrix.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum PoseConvention {
@@ -108,6 +111,16 @@ pub fn load(folder: impl AsRef<Path>, convention: PoseConvention) -> Result<Scen
 /// Reads a folder as [`load`] does, with the options of `reading`.
 pub(super) fn load_with(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     let (poses_path, k_path) = (folder.join("poses.txt"), folder.join("K.txt"));
+    if !k_path.is_file() {
+        let expected = "intrinsics beside poses.txt: fx fy cx cy, or a 3x3 matrix";
+        let got = if folder.join(KITTI).is_file() {
+            "none; calib.txt is KITTI's: write the 1st, 6th, 3rd and 7th number of its line P0 (cameras of image_0) \
+             into K.txt, and name the folder of its pictures by --images image_0"
+        } else {
+            "none"
+        };
+        return Err(Error::format(&k_path, expected, got));
+    }
     let k = parse_intrinsics(&text(&k_path)?)
         .map_err(|got| Error::format(&k_path, "a 3x3 intrinsic matrix, or fx fy cx cy", got))?;
     let mut poses = Vec::new();

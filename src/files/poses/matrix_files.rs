@@ -34,7 +34,7 @@ const SCANNET: &str = "intrinsic/intrinsic_color.txt";
 const INTRINSICS: [&str; 5] =
     [SCANNET, "intrinsic_color.txt", "intrinsics.txt", "camera-intrinsics.txt", "K.txt"];
 /// End of the name of a pose of 7-Scenes.
-pub(super) const POSE: &str = ".pose.txt";
+const POSE: &str = ".pose.txt";
 /// Intrinsics that 7-Scenes' authors name, and the size of their pictures.
 const KINECT: Optics = Optics { k: [585.0, 585.0, 320.0, 240.0], size: Some((640, 480)) };
 /// Longest pose file, bytes.
@@ -122,6 +122,18 @@ pub(super) fn count(folder: &Path) -> usize {
     let Some(layout) = Layout::of(folder) else { return 0 };
     let has_pictures = PICTURES[..4].iter().any(|name| folder.join(name).is_dir());
     if layout.is_7_scenes() || has_pictures { layout.files().len() } else { 0 }
+}
+
+/// The first pose in `folder`.
+pub(super) fn first(folder: &Path) -> Option<PathBuf> {
+    Layout::of(folder)?.files().into_iter().next()
+}
+
+/// The folder of the scene of which `file` is a pose.
+pub(super) fn scene_of(file: &Path) -> Option<&Path> {
+    let poses = file.parent()?;
+    let mut scenes = [poses.parent(), Some(poses)].into_iter().flatten();
+    scenes.find(|scene| Layout::of(scene).is_some_and(|layout| layout.poses == poses))
 }
 
 /// Reports whether `folder` has one of these layouts.

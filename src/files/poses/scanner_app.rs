@@ -46,6 +46,16 @@ pub(super) fn count(folder: &Path) -> usize {
     if is_frame { all.len() } else { 0 }
 }
 
+/// The first frame's file in `folder`.
+pub(super) fn first(folder: &Path) -> Option<PathBuf> {
+    frames(folder).into_iter().next()
+}
+
+/// Returns whether a file is that of a frame.
+pub(super) fn is_frame(file: &Path) -> bool {
+    parse(file).is_ok()
+}
+
 fn parse(file: &Path) -> Result<Frame> {
     let expected = "a frame of 3D Scanner App (cameraPoseARFrame, intrinsics)";
     json::parse(file, &read(file)?, expected)

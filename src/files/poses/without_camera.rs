@@ -15,6 +15,9 @@ const NAMES: usize = 3;
 /// and `r_0_normal_0001.png` beside `r_0.png`.
 const COMPANIONS: [&str; 4] = ["mask", "depth", "normal", "disp"];
 
+/// The same as whole words: 3D Scanner App has `conf_00000.png` beside `frame_00000.jpg`.
+const COMPANION_WORDS: [&str; 2] = ["conf", "confidence"];
+
 /// A folder of pictures.
 struct Folder {
     /// Its path as the frames have it.
@@ -86,7 +89,8 @@ pub(super) fn line(path: &Path, frames: &[Frame], left_out: &[LeftOut]) -> Optio
         }
         let is_photograph = |image: &PathBuf| {
             let (stem, name) = (stem(image), image.file_name().unwrap_or_default());
-            let is_companion = COMPANIONS.iter().any(|word| stem.contains(word));
+            let is_companion = COMPANIONS.iter().any(|word| stem.contains(word))
+                || stem.split(['_', '-', '.', ' ']).any(|word| COMPANION_WORDS.contains(&word));
             let is_known = folder.stems.contains(&stem) || named.contains(&stem);
             !is_companion && !is_known && !folder.maps.contains(name)
         };

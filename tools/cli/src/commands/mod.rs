@@ -27,6 +27,7 @@ mod poses;
 mod reconstruct;
 mod render;
 mod run;
+mod trained;
 pub mod values;
 pub mod video;
 #[cfg(feature = "view")]

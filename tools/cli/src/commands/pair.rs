@@ -3,6 +3,7 @@
 use super::args::{PairArgs, PoseConventionArg, ReadArgs};
 use super::convention::fitting;
 use super::frames;
+use super::trained::{instead_of_photographs, is_of_training};
 use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
@@ -11,7 +12,7 @@ use std::path::{Path, PathBuf};
 use subsplat::cameras::estimation::{Confidence, PoseOptions, Uncertain};
 use subsplat::files::photos::folder::{FolderPhotographs, find_photographs, is_folder_of_masks};
 use subsplat::files::photos::image::{LoadOptions, Truncated, probe};
-use subsplat::files::photos::photograph::{PhotographHeader, probe_photograph};
+use subsplat::files::photos::photograph::{PhotographHeader, load_photograph, probe_photograph};
 use subsplat::files::photos::video::is_video;
 use subsplat::files::poses::find::{folders, is_own_output, not_read};
 use subsplat::files::poses::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
@@ -29,6 +30,9 @@ const WITH_CONVENTION: [SceneFormat; 6] = [
     SceneFormat::MvsNet,
     SceneFormat::MatrixFiles,
 ];
+
+/// End of a line about a file with several pictures.
+const FIRST_READ: &str = "is read";
 
 /// A scene, and whether its cameras are an estimate of low confidence.
 pub struct Loaded {
@@ -65,11 +69,11 @@ pub fn load(
             intrinsics: args.intrinsics.as_deref(),
             force: args.force,
             projection: args.lens.unwrap_or_default(),
+            strict: args.read.strict,
         };
         let estimated = estimate(&input[0], &photographs, &options, bar)?;
         bar.suspend(|| print_estimate(&estimated));
         let doubtful = estimated.estimate.confidence == Confidence::Low;
-            strict: args.read.strict,
         return Ok(Loaded { scene: estimated.scene, doubtful });
     }
     let [one] = input else {
@@ -83,7 +87,14 @@ pub fn load(
     }
     let convention = args.pose_convention.map(PoseConvention::from);
     let options = args.read.options(convention);
-    let scene = load_scene_with(one, &options)?;
+    let scene = match load_scene_with(one, &options) {
+        Ok(scene) => scene,
+        // A training has cameras, and its photographs lie elsewhere.
+        Err(error) if is_of_training(one) => {
+            return Err(instead_of_photographs(one).unwrap_or_else(|| error.into()));
+        }
+        Err(error) => return Err(error.into()),
+    };
     ensure!(
         convention.is_none() || WITH_CONVENTION.contains(&scene.source),
         "--pose-convention: expected two photographs, or a scene with poses.txt, transforms.json, a \
@@ -140,6 +151,9 @@ pub fn photographs(input: &[PathBuf], read: &ReadArgs) -> Result<Option<Vec<Path
             return of_folder(one, read.strict).map(Some);
         }
         let is_picture = one.is_file() && probe(one).is_ok();
+        if is_picture {
+            ensure_several(one)?;
+        }
         ensure!(
             !is_picture,
             "{}: expected a scene or at least two photographs, got one photograph",
@@ -171,6 +185,15 @@ pub fn photographs(input: &[PathBuf], read: &ReadArgs) -> Result<Option<Vec<Path
         }
     }
     Ok(Some(all))
+}
+
+/// Refuses the only picture where its file has more than one.
+fn ensure_several(path: &Path) -> Result<()> {
+    let warnings = load_photograph(path, &LoadOptions::default()).map(|p| p.warnings);
+    let several = warnings.unwrap_or_default().into_iter().find(|line| line.ends_with(FIRST_READ));
+    several.map_or(Ok(()), |line| {
+        bail!("expected at least two photographs, got one file: {line}; save each picture as a file of its own")
+    })
 }
 
 /// Prints what is left out of a folder's photographs; an error where `strict`.
@@ -229,6 +252,14 @@ fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
         folder.display(),
         deeper.join(", ")
     );
+    if found.photographs.is_empty()
+        && let Some(error) = instead_of_photographs(folder)
+    {
+        return Err(error);
+    }
+    if let [one] = found.photographs.as_slice() {
+        ensure_several(one)?;
+    }
     ensure!(
         found.photographs.len() >= 2,
         "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a RealEstate10K txt, poses.txt \
@@ -285,6 +316,8 @@ pub struct EstimateRequest<'a> {
     pub force: bool,
     /// Projection of the photographs.
     pub projection: Projection,
+    /// Refuse a photograph that would be left out.
+    pub strict: bool,
 }
 
 /// Estimates the cameras of photographs; `bar` shows the photograph that is read.
@@ -308,6 +341,7 @@ pub fn estimate(
         poses: PoseOptions::default().with_uncertain(uncertain),
         load: LoadOptions { truncated },
         projection: request.projection,
+        strict: request.strict,
     };
     let wide = matches!(options.projection, Projection::Panorama | Projection::Fisheye(_));
     ensure!(
@@ -316,8 +350,6 @@ pub fn estimate(
          (give fisheye:DEGREES)"
     );
     let mut show = |i: usize| {
-    /// Refuse a photograph that would be left out.
-    pub strict: bool,
         bar.set_message(format!("photograph {} of {}", i + 1, photographs.len()));
         Ok(())
     };
@@ -341,7 +373,6 @@ pub fn print_estimate(estimated: &EstimatedScene) {
     print_line(format!(
         "the cameras of {placed} of {} photographs were estimated from {} shared points: {certain} \
          (error of rotations {}, of directions between cameras {}); the unit of length is the median \
-        strict: request.strict,
          distance of the points",
         estimate.cameras.len(),
         estimate.points.len(),

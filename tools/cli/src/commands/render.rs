@@ -4,6 +4,7 @@ use super::args::{LowpassArg, PathArg, RenderArgs, RenderingArgs, SceneFormatArg
 use super::depth_colour::colour_depth;
 use super::frames::{self, DepthSpread};
 use super::memory;
+use super::trained::{Trained, finished, folder_of, named, trained};
 use super::{video, whole};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
@@ -14,7 +15,6 @@ use std::path::{Path, PathBuf};
 use subsplat::files::photos::image::{probe, save_depth_png, save_png};
 use subsplat::files::photos::photograph::list_photographs;
 use subsplat::files::poses::cameras_json::is_cameras_json;
-use subsplat::files::poses::find::folders;
 use subsplat::files::poses::reading::SceneOptions;
 use subsplat::files::poses::scene::{self, load_cameras_with, load_scene_with};
 use subsplat::files::{is_splat_file, load_splat_file};
@@ -140,10 +140,25 @@ pub fn scene_file(path: &Path) -> Result<PathBuf> {
     }
     let readable = SceneFormatArg::value_variants().iter().filter(|f| **f != SceneFormatArg::Html);
     let files = readable.map(|f| path.join(f.file_name()));
-    if let Some(file) = files.into_iter().find(|f| f.is_file()).or_else(|| trained(path)) {
+    if let Some(file) = files.into_iter().find(|f| f.is_file()) {
+        return Ok(file);
+    }
+    if let Some(Trained { file, note }) = trained(path) {
+        note.iter().for_each(print_warning);
         return Ok(file);
     }
     let name = path.display();
+    let scenes = finished(path);
+    if let [one] = scenes.as_slice() {
+        print_line(format!("{name}: the scene is {}", one.display()));
+        return if one.is_dir() { scene_file(one) } else { Ok(one.clone()) };
+    }
+    ensure!(
+        scenes.is_empty(),
+        "{name}: expected one scene, got {}: give one of {}",
+        scenes.len(),
+        named(&scenes)
+    );
     let hint = if scene::is_scene(path) || list_photographs(path).len() >= 2 {
         format!("; it holds photographs: reconstruct them by `subsplat run {name}`")
     } else {
@@ -153,27 +168,6 @@ pub fn scene_file(path: &Path) -> Result<PathBuf> {
         "{name}: expected a scene file, or a folder with scene.ply as `subsplat run` writes it, \
          got a folder without one{hint}"
     )
-}
-
-/// Folder of the states of a training of 3D Gaussian Splatting, and the file of each.
-const TRAINED: [&str; 2] = ["point_cloud", "point_cloud.ply"];
-
-/// The last state of a training: `point_cloud/iteration_N/point_cloud.ply` with the largest N.
-fn trained(folder: &Path) -> Option<PathBuf> {
-    let [states, file] = TRAINED;
-    let steps = |state: &PathBuf| -> Option<u64> {
-        state.file_name()?.to_str()?.strip_prefix("iteration_")?.parse().ok()
-    };
-    let all = folders(folder.join(states)).into_iter().filter(|state| state.join(file).is_file());
-    let last = all.filter(|state| steps(state).is_some()).max_by_key(steps)?;
-    Some(last.join(file))
-}
-
-/// Folder in which cameras of the scene `file` lie: its own, or that of the training.
-fn folder_of(file: &Path) -> &Path {
-    let own = file.parent().unwrap_or(Path::new(""));
-    let states = own.parent().filter(|states| states.ends_with(TRAINED[0]));
-    states.and_then(Path::parent).unwrap_or(own)
 }
 
 /// Rejects cameras whose pictures exceed the memory, with the frame's name.

@@ -474,6 +474,12 @@ impl Done {
             peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
         ));
         answer.line(&self.assessment.verdict);
+        let SourceArgs { near, far, .. } = &args.source;
+        if self.assessment.verdict.trust != Trust::Good && (near.is_some() || far.is_some()) {
+            print_warning(
+                "--near and --far may be the cause: without them the distances are estimated from the photographs",
+            );
+        }
         if plan.doubtful {
             print_warning(
                 "the estimated cameras are doubtful, and with them every view of the scene",
