@@ -19,6 +19,7 @@ use crate::scene::mask::Mask;
 use crate::scene::pictures::Rgb;
 use glam::{DMat3, DVec2, DVec3, Mat4};
 use std::f64::consts::PI;
+use std::ops::Range;
 use std::path::Path;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
@@ -97,7 +98,43 @@ enum Shape {
     Panorama {
         width: usize,
         height: usize,
+        /// The part that the photograph shows.
+        part: Part,
     },
+}
+
+/// Least share of a view that the shown part of a panorama fills.
+const LEAST_SHOWN: f64 = 0.25;
+
+/// The rectangle of a panorama that is not masked.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Part {
+    /// Left and top edge, px.
+    low: [f64; 2],
+    /// Right and bottom edge, px.
+    high: [f64; 2],
+}
+
+impl Part {
+    /// The rectangle around the pixels that a mask keeps.
+    fn of(mask: Option<&Mask>, [width, height]: [usize; 2]) -> Self {
+        let whole = Self { low: [0.0; 2], high: [width as f64, height as f64] };
+        let Some(mask) = mask else { return whole };
+        let (mut low, mut high) = ([usize::MAX; 2], [0; 2]);
+        let kept = mask.kept().iter().enumerate().filter(|(_, kept)| **kept);
+        for (i, _) in kept {
+            let at = [i % width, i / width];
+            low = [low[0].min(at[0]), low[1].min(at[1])];
+            high = [high[0].max(at[0] + 1), high[1].max(at[1] + 1)];
+        }
+        let px = |at: [usize; 2]| at.map(|v| v as f64);
+        if high == [0; 2] { whole } else { Self { low: px(low), high: px(high) } }
+    }
+
+    /// Returns whether a view shows enough of it.
+    fn is_in(&self, cut: &Cut) -> bool {
+        cut.share_of(self.low, self.high) >= LEAST_SHOWN
+    }
 }
 
 /// A photograph as the estimation sees it.
@@ -175,6 +212,14 @@ fn of_panorama(
         return Err(FileError::format(path, expected, format!("{width}x{height} pixels")).into());
     }
     let axes = own_axes();
+    let part = Part::of(photograph.mask.as_ref(), [width, height]);
+    let shown = axes.iter().filter(|axes| part.is_in(&panorama_cut(width, height, **axes))).count();
+    if shown < 2 {
+        let degrees = [0, 1].map(|i| 360.0 * (part.high[i] - part.low[i]) / width as f64);
+        let got = format!("one of {:.0}x{:.0} degrees", degrees[0], degrees[1]);
+        let expected = "a panorama that fills at least two views of 90 degrees";
+        return Err(FileError::format(path, expected, got).into());
+    }
     let views: Vec<(Rgb, Option<Mask>)> = axes
         .iter()
         .map(|axes| panorama_cut(width, height, *axes))
@@ -191,7 +236,7 @@ fn of_panorama(
         .collect();
     // A panorama shows more than one photograph, but each part of it is matched with one part of another.
     let photo = PosePhoto::from_views(&views, panorama_view(width), features / 3)?;
-    let shape = Shape::Panorama { width, height };
+    let shape = Shape::Panorama { width, height, part };
     Ok(Prepared { photo, source: LensSource::Panorama, warnings, shape })
 }
 
@@ -306,7 +351,7 @@ pub(super) fn straight_photo(
 
 /// Frames of photographs with estimated cameras.
 pub(super) struct Posed {
-    /// One frame for a photograph, [`YAWS`] for a panorama; in the order of the photographs.
+    /// One frame for a photograph, at most [`YAWS`] for a panorama; in the order of the photographs.
     pub views: Vec<PosedView>,
     /// For each point of the estimate, the frames that show it and its positions in them, px.
     pub observations: Vec<Vec<(usize, [f32; 2])>>,
@@ -344,18 +389,21 @@ impl Shapes {
             .collect();
         let axes = shared_axes(&panoramas);
         let mut views = Vec::new();
-        let mut first = vec![None; self.0.len()];
+        let mut of_photo = vec![0..0; self.0.len()];
         for (i, shape, path, camera) in placed() {
-            first[i] = Some(views.len());
+            let first = views.len();
             let one =
                 |cut| PosedView { photograph: path.to_owned(), cut, label: String::new(), camera };
             match shape {
                 Shape::Pinhole => views.push(one(None)),
                 Shape::View(cut) => views.push(one(Some(cut))),
-                Shape::Panorama { width, height } => {
+                Shape::Panorama { width, height, part } => {
                     let (rotation, position) = axes_and_position(&camera);
                     for (n, view) in axes.iter().enumerate() {
                         let cut = panorama_cut(width, height, rotation.transpose() * *view);
+                        if !part.is_in(&cut) {
+                            continue;
+                        }
                         let pose = Mat4::from_mat3_translation(view.as_mat3(), position.as_vec3());
                         // The intrinsics are those of a panorama's view, the axes orthonormal.
                         let camera = Camera::new(cut.view, pose).unwrap_or(camera);
@@ -364,11 +412,12 @@ impl Shapes {
                     }
                 }
             }
+            of_photo[i] = first..views.len();
         }
         let observations = estimate
             .points
             .iter()
-            .map(|point| self.observed(point, &first, &views, &estimate.cameras))
+            .map(|point| self.observed(point, &of_photo, &views, &estimate.cameras))
             .collect();
         Posed { views, observations }
     }
@@ -377,20 +426,22 @@ impl Shapes {
     fn observed(
         &self,
         point: &PosePoint,
-        first: &[Option<usize>],
+        of_photo: &[Range<usize>],
         views: &[PosedView],
         cameras: &[Option<Camera>],
     ) -> Vec<(usize, [f32; 2])> {
         let mut all = Vec::new();
         for (photo, px) in &point.observations {
-            let (Some(start), Some(camera)) = (first[*photo], cameras[*photo]) else { continue };
+            let Some(camera) = cameras[*photo] else { continue };
+            let frames = of_photo[*photo].clone();
             let Shape::Panorama { .. } = self.0[*photo] else {
-                all.push((start, *px));
+                all.push((frames.start, *px));
                 continue;
             };
             let ray = own_ray(&camera.intrinsics(), *px);
             let (rotation, _) = axes_and_position(&camera);
-            for (i, view) in views[start..start + YAWS].iter().enumerate() {
+            for i in frames {
+                let view = &views[i];
                 let k = view.camera.intrinsics();
                 let ray = axes_and_position(&view.camera).0.transpose() * (rotation * ray);
                 let at = ray.truncate() / ray.z;
@@ -398,7 +449,7 @@ impl Shapes {
                 let inside = (0.0..=k.width as f32).contains(&at[0])
                     && (0.0..=k.height as f32).contains(&at[1]);
                 if ray.z > 0.0 && inside {
-                    all.push((start + i, at));
+                    all.push((i, at));
                 }
             }
         }

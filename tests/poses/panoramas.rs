@@ -1,7 +1,10 @@
 //! Cameras of panoramas and of fisheye pictures, which a ray caster draws (`box_room`).
 
 use glam::{DMat3, DVec3};
+use std::path::Path;
 use subsplat::cameras::estimation::Confidence;
+use subsplat::image::ExtendedColorType;
+use subsplat::image::codecs::jpeg::JpegEncoder;
 use subsplat::kernels::camera::Camera;
 use subsplat::reconstruct::{FisheyeCurve, FisheyeLens, LensSource, Projection};
 use subsplat::{EstimateOptions, EstimatedScene, Result, Rgb, estimate_cameras_of_files, save_png};
@@ -199,4 +202,75 @@ fn one_bad_photograph_is_left_out_of_several() {
     assert!(read(&files[..2], &options).unwrap_err().to_string().contains("cut.png: expected"));
     options.strict = true;
     assert!(read(&files, &options).unwrap_err().to_string().contains("cut.png: expected"));
+}
+
+/// A part of a panorama as a JPEG with GPano's properties.
+fn save_part(file: &Path, whole: &Rgb, [left, top]: [usize; 2], [width, height]: [usize; 2]) {
+    let row = |y: usize| &whole.data[3 * (y * whole.width + left)..][..3 * width];
+    let data: Vec<u8> = (top..top + height).flat_map(row).copied().collect();
+    let mut bytes = Vec::new();
+    let mut encoder = JpegEncoder::new_with_quality(&mut bytes, 96);
+    encoder.encode(&data, width as u32, height as u32, ExtendedColorType::Rgb8).unwrap();
+    let xmp = format!(
+        "http://ns.adobe.com/xap/1.0/\0<x GPano:ProjectionType=\"equirectangular\" \
+         GPano:FullPanoWidthPixels=\"{}\" GPano:FullPanoHeightPixels=\"{}\" \
+         GPano:CroppedAreaLeftPixels=\"{left}\" GPano:CroppedAreaTopPixels=\"{top}\" \
+         GPano:CroppedAreaImageWidthPixels=\"{width}\" GPano:CroppedAreaImageHeightPixels=\"{height}\"/>",
+        whole.width, whole.height
+    );
+    let length = (xmp.len() as u16 + 2).to_be_bytes();
+    let segment = [&[0xff, 0xe1], &length[..], xmp.as_bytes()].concat();
+    bytes.splice(2..2, segment);
+    std::fs::write(file, bytes).unwrap();
+}
+
+/// Parts of panoramas are cut into the views that they fill.
+#[test]
+fn parts_of_panoramas_get_their_cameras() {
+    let folder = tempfile::tempdir().unwrap();
+    let files = ["a.jpg", "b.jpg"].map(|name| folder.path().join(name));
+    let save = |[left, top]: [usize; 2], size: [usize; 2]| {
+        for (i, file) in files.iter().enumerate() {
+            let whole = panorama(WIDTH, places()[i].1, places()[i].0);
+            save_part(file, &whole, [left, top], size);
+        }
+    };
+    let read = || {
+        let options = EstimateOptions::default();
+        estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(()))
+    };
+    // 240 by 127 degrees: at least one view of each lies in the gap.
+    save([170, 70], [683, 360]);
+    let found = read().unwrap();
+    check_cameras(&found, 0.3, 1.0);
+    let frames = &found.scene.frames;
+    assert!((6..=10).contains(&frames.len()), "{}", frames.len());
+    let first = found.estimate.cameras[0].unwrap().rotation().as_dmat3();
+    let room_from_world = places()[0].0 * first.transpose();
+    let mut whole = 0;
+    for frame in frames {
+        let loaded = frame.load_with(&subsplat::LoadOptions::default()).unwrap();
+        let share = loaded
+            .mask
+            .as_ref()
+            .map_or(1.0, |mask| mask.count() as f64 / (mask.width() * mask.height()) as f64);
+        assert!(share > 0.2, "{}: {share}", frame.name);
+        if loaded.mask.is_none() {
+            let place = places()[usize::from(frame.image == files[1])].1;
+            let axes = room_from_world * loaded.camera.rotation().as_dmat3();
+            let off = difference(&loaded.picture, &loaded.camera.intrinsics(), place, axes);
+            assert!(off < 8.0, "{}: {off}", frame.name);
+            whole += 1;
+        }
+    }
+    assert!(whole >= 4, "{whole}");
+    for (frame, px) in found.observations.iter().flatten() {
+        let k = frames[*frame].camera.intrinsics();
+        assert!(px[0] <= k.width as f32 && px[1] <= k.height as f32);
+    }
+    assert!(median_reprojection(&found) < 0.5);
+    // 46 by 53 degrees.
+    save([450, 180], [130, 150]);
+    let error = read().unwrap_err().to_string();
+    assert!(error.contains("two views of 90 degrees, got one of 46x53 degrees"), "{error}");
 }

@@ -10,6 +10,7 @@
 //! multiplied, 2 is one by which they are not. Without the tag it is read as 2, as OpenCV and others write it.
 
 use super::bars::bars;
+use super::gpano::Gpano;
 use super::image::{LoadOptions, MAX_PIXELS, Probe, Truncated};
 use super::programs::Kind;
 use super::tiff_tags::{EXTRA_SAMPLES, is_tiff, numbers};
@@ -38,8 +39,8 @@ pub(super) struct Decoded<'a> {
     pub orientation: Orientation,
     /// EXIF block: a TIFF structure.
     pub exif: Option<Cow<'a, [u8]>>,
-    /// The metadata state an equirectangular panorama.
-    pub panorama: bool,
+    /// Metadata of an equirectangular panorama.
+    pub panorama: Option<Gpano>,
     /// Warnings for the user, with the file's path.
     pub warnings: Vec<String>,
 }
@@ -63,14 +64,14 @@ pub(super) struct Raster<'a> {
     pub profile: Option<Vec<u8>>,
     pub orientation: Orientation,
     pub exif: Option<Cow<'a, [u8]>>,
-    pub panorama: bool,
+    pub panorama: Option<Gpano>,
 }
 
 impl Raster<'_> {
     /// Upright pixels without metadata.
     pub fn of(pixels: DynamicImage) -> Self {
         let orientation = Orientation::NoTransforms;
-        Self { pixels, profile: None, orientation, exif: None, panorama: false }
+        Self { pixels, profile: None, orientation, exif: None, panorama: None }
     }
 
     /// The same, with a copy of the EXIF block.
@@ -201,7 +202,7 @@ pub(super) fn header(path: &Path) -> Result<Header> {
     };
     let orientation = (orientation > 1).then_some(orientation);
     let probe = Probe { width, height, orientation };
-    let panorama = is_panorama(&mut *decoder);
+    let panorama = panorama(&mut *decoder).is_some();
     Ok(Header { probe, exif, panorama, warnings })
 }
 
@@ -283,7 +284,7 @@ pub(super) fn native<'a>(
         ImageFormat::Tiff => Some(Cow::Borrowed(bytes)),
         _ => decoder.exif_metadata().ok().flatten().map(Cow::Owned),
     };
-    let panorama = is_panorama(&mut *decoder);
+    let panorama = panorama(&mut *decoder);
     let (width, height) = decoder.dimensions();
     let pixels = match reduction(width, height, path)? {
         1 => DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?,
@@ -347,13 +348,10 @@ fn divide_by_alpha(pixels: &mut DynamicImage) {
     }
 }
 
-/// Returns whether the XMP block states an equirectangular panorama: GPano's `ProjectionType`, which cameras,
-/// phones and stitchers write (Google, "Photo Sphere XMP Metadata").
-fn is_panorama(decoder: &mut dyn ImageDecoder) -> bool {
-    let block = decoder.xmp_metadata().ok().flatten().unwrap_or_default();
-    let text = String::from_utf8_lossy(&block);
-    let value = text.split("ProjectionType").nth(1).unwrap_or_default();
-    value.trim_start_matches(['=', '>', '"', '\'', ' ']).starts_with("equirectangular")
+/// What the XMP block states of a panorama.
+fn panorama(decoder: &mut dyn ImageDecoder) -> Option<Gpano> {
+    let block = decoder.xmp_metadata().ok().flatten()?;
+    Gpano::of_xmp(&String::from_utf8_lossy(&block))
 }
 
 /// Checks what the JPEG decoder does not: the end of the file and the kind of CMYK.

@@ -6,6 +6,7 @@ mod decode;
 pub mod distortion;
 pub mod exif;
 pub mod folder;
+mod gpano;
 mod heic;
 mod heif;
 mod icc;

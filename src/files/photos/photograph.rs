@@ -139,8 +139,8 @@ pub fn load_photograph(path: impl AsRef<Path>, options: &LoadOptions) -> Result<
 /// A photograph with what the file says of its projection.
 pub(crate) type PhotographOrPanorama = (Photograph, bool);
 
-/// [`load_photograph`] of photographs and panoramas; `true` for a panorama by its metadata. There is no warning
-/// of the shape of a panorama.
+/// [`load_photograph`] of photographs and panoramas; `true` for a panorama by its metadata. A part of a panorama becomes
+/// the whole, masked around it. There is no warning of the shape of a panorama.
 ///
 /// # Errors
 /// Those of [`load_photograph`] but for panoramas.
@@ -194,7 +194,7 @@ fn decode_upright(
     let decoded = decode_photograph(bytes, options, path)?;
     let Rgb { width, height, .. } = decoded.picture;
     let mut report = report(decoded.exif.as_deref(), width, height, path);
-    if decoded.panorama {
+    if decoded.panorama.is_some() {
         report.camera.focal = None;
     }
     let image = upright(decoded.picture, decoded.orientation)?;
@@ -219,7 +219,13 @@ fn decode_upright(
     });
     let mask = masks::checked(mask, path)?;
     let camera = report.camera;
-    Ok((Photograph { image, mask, orientation, camera, warnings }, decoded.panorama))
+    let place = decoded.panorama.and_then(|of| of.place(width, height));
+    let (image, mask) = match place.filter(|_| orientation.is_none()) {
+        Some(place) => place.whole(&image, mask.as_ref()),
+        None => (image, mask),
+    };
+    let panorama = decoded.panorama.is_some();
+    Ok((Photograph { image, mask, orientation, camera, warnings }, panorama))
 }
 
 /// Applies an EXIF orientation.

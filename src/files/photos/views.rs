@@ -51,6 +51,22 @@ impl Cut {
         inside.then_some([u, v])
     }
 
+    /// Share of the view that shows what lies between the left and top corner `low` and the right and bottom corner
+    /// `high` of the picture, px; 0 to 1.
+    pub fn share_of(&self, low: [f64; 2], high: [f64; 2]) -> f64 {
+        /// Positions on each side that are tried.
+        const SIDE: usize = 16;
+        let Intrinsics { width, height, .. } = self.view;
+        let at = |i: usize, side: usize| (i as f64 + 0.5) / SIDE as f64 * side as f64;
+        let places =
+            (0..SIDE * SIDE).map(|i| DVec2::new(at(i % SIDE, width), at(i / SIDE, height)));
+        let inside = |px: &DVec2| {
+            let source = self.source(*px);
+            source.is_some_and(|px| (0..2).all(|i| (low[i]..=high[i]).contains(&px[i])))
+        };
+        places.filter(inside).count() as f64 / (SIDE * SIDE) as f64
+    }
+
     /// Samples the view from its picture, whose pixels `mask` keeps (all without one). The mask of the result
     /// excludes pixels that the picture does not show; `None` where all count.
     pub fn apply(&self, picture: &Rgb, mask: Option<&Mask>) -> (Rgb, Option<Mask>) {
