@@ -657,6 +657,15 @@ fn scanner_app_is_read() {
     check(&scene, SceneFormat::ScannerApp, &cameras);
     assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
     assert_eq!(scene.units, Units::Metres);
+    // Maps of confidence are no photographs without a camera.
+    for name in ["conf_00000.png", "conference.png"] {
+        save_png(at(name.into()), &noise(64, 48)).unwrap();
+    }
+    let warnings = load_scene(folder.path()).unwrap().warnings;
+    assert!(warnings.len() == 1 && warnings[0].starts_with("1 of 7 pictures"), "{warnings:?}");
+    ["conf_00000.png", "conference.png"]
+        .iter()
+        .for_each(|name| std::fs::remove_file(at((*name).into())).unwrap());
     write(&at("frame_00001.json".into()), "{");
     write(
         &at("frame_00002.json".into()),

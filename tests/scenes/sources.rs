@@ -219,3 +219,57 @@ fn a_mirrored_world_is_named() {
     let scene = load_scene(folder.path()).unwrap();
     assert!(scene.frames.len() == 3 && scene.left_out[0].reason.contains("determinant"));
 }
+
+/// The names of other sources are those that `model` reads again.
+#[test]
+fn other_sources_are_read_by_their_names() {
+    let (folder, cameras) = made_up(3);
+    let at = |name: &str| folder.path().join(name);
+    write_transforms(&at("transforms.json"), &cameras, str::to_owned);
+    std::fs::create_dir_all(at("pose")).unwrap();
+    std::fs::create_dir_all(at("keyframes/cameras")).unwrap();
+    std::fs::create_dir_all(at("keyframes/images")).unwrap();
+    let mut poses = String::new();
+    for (i, c) in cameras.iter().enumerate() {
+        let rows = c.camera.world_from_camera().transpose().to_cols_array();
+        let line = rows.map(|v| v.to_string()).join(" ");
+        std::fs::write(at(&format!("pose/{i:03}.txt")), &line).unwrap();
+        poses += &format!("{line}\n");
+        let frame = json!({
+            "cameraPoseARFrame": rows, "intrinsics": [70, 0, 32, 0, 70, 24, 0, 0, 1]
+        });
+        std::fs::write(at(&format!("frame_{i:05}.json")), frame.to_string()).unwrap();
+        save_png(at(&format!("frame_{i:05}.png")), &noise(64, 48)).unwrap();
+        let mut key_frame =
+            json!({ "fx": 70, "fy": 70, "cx": 32, "cy": 24, "width": 64, "height": 48 });
+        for (j, v) in rows[..12].iter().enumerate() {
+            key_frame[format!("t_{}{}", j / 4, j % 4)] = json!(v);
+        }
+        let file = format!("keyframes/cameras/{i}.json");
+        std::fs::write(at(&file), key_frame.to_string()).unwrap();
+        save_png(at(&format!("keyframes/images/{i}.png")), &noise(64, 48)).unwrap();
+    }
+    std::fs::write(at("intrinsics.txt"), "70 0 32 0 70 24 0 0 1").unwrap();
+    std::fs::write(at("poses.txt"), &poses).unwrap();
+    std::fs::write(at("K.txt"), "70 70 32 24").unwrap();
+    let scene = load_scene(folder.path()).unwrap();
+    assert_eq!(scene.source, SceneFormat::Transforms);
+    let expected = [
+        ("poses.txt", SceneFormat::Matrices),
+        ("keyframes", SceneFormat::Polycam),
+        ("frame_00000.json", SceneFormat::ScannerApp),
+        ("pose/000.txt", SceneFormat::MatrixFiles),
+    ];
+    assert_eq!(scene.other_sources, expected.map(|(name, _)| name));
+    for (name, format) in expected {
+        let options = SceneOptions { model: Some(name.into()), ..SceneOptions::default() };
+        let read = load_scene_with(folder.path(), &options).unwrap();
+        assert_eq!((read.source, read.frames.len()), (format, 3), "{name}");
+    }
+    // KITTI has its intrinsics elsewhere.
+    std::fs::remove_file(at("K.txt")).unwrap();
+    let options = SceneOptions { model: Some("poses.txt".into()), ..SceneOptions::default() };
+    refused("K.txt", load_scene_with(folder.path(), &options), &["intrinsics beside", "got none"]);
+    std::fs::write(at("calib.txt"), "P0: 70 0 32 0 0 70 24 0 0 0 1 0").unwrap();
+    refused("KITTI", load_scene_with(folder.path(), &options), &["KITTI's", "line P0"]);
+}

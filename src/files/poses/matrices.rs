@@ -114,8 +114,8 @@ pub(super) fn load_with(folder: &Path, reading: &Reading<'_>) -> Result<Scene> {
     if !k_path.is_file() {
         let expected = "intrinsics beside poses.txt: fx fy cx cy, or a 3x3 matrix";
         let got = if folder.join(KITTI).is_file() {
-            "none; calib.txt is KITTI's: write the 1st, 6th, 3rd and 7th number of its line P0 (cameras of image_0) \
-             into K.txt, and name the folder of its pictures by --images image_0"
+            "none; calib.txt is KITTI's: write the 1st, 6th, 3rd and 7th number of its line P0 into K.txt, \
+             and name the folder of its pictures, such as --images image_2"
         } else {
             "none"
         };

@@ -3,7 +3,7 @@
 use super::args::{PairArgs, PoseConventionArg, ReadArgs};
 use super::convention::fitting;
 use super::frames;
-use super::trained::{instead_of_photographs, is_of_training};
+use super::trained::{finished, instead_of_photographs, is_of_training};
 use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
@@ -219,6 +219,10 @@ fn of_folder(folder: &Path, strict: bool) -> Result<Vec<PathBuf>> {
         below = with_photographs(&first);
         if below.is_empty() {
             if let Some(scene) = first.iter().find(|folder| has_scene(folder)) {
+                let trained = finished(scene).into_iter().find(|found| found.is_dir());
+                if let Some(error) = trained.and_then(|found| instead_of_photographs(&found)) {
+                    return Err(error);
+                }
                 bail!(
                     "{}: expected a scene or photographs, got a folder with a scene below it: give {}",
                     folder.display(),

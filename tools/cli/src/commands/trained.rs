@@ -14,6 +14,8 @@ const ARGUMENTS: &str = "cfg_args";
 const START: usize = 4096;
 /// Words of the header of a .ply of Gaussians: scales, or the packed form of SuperSplat.
 const GAUSSIANS: [&str; 2] = [" scale_0", " packed_position"];
+/// Extensions of splat files beside .ply. Other programs have zip archives and meshes of the same first bytes.
+const EXTENSIONS: [&str; 4] = ["spz", "splat", "ksplat", "sog"];
 /// Most files of a folder that are looked at, and most scenes that a message names.
 const MOST: (usize, usize) = (200, 4);
 
@@ -87,12 +89,15 @@ fn has_rows(file: &Path) -> bool {
 
 /// Returns whether a file has splats: of a .ply its properties decide, as a cloud of points is one too.
 fn is_finished(file: &Path) -> bool {
-    let ply = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply"));
+    let extension = file.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     let gaussians = || {
         let start = start(file);
         GAUSSIANS.iter().any(|word| start.contains(word)) && has_rows(file)
     };
-    is_splat_file(file) && (!ply || gaussians())
+    match extension.as_str() {
+        "ply" => gaussians(),
+        other => EXTENSIONS.contains(&other) && is_splat_file(file),
+    }
 }
 
 /// Finished scenes in `folder` and in the two levels below: folders of trainings, and splat files.
@@ -225,6 +230,7 @@ mod tests {
         assert!(finished(place.path()).is_empty());
         assert!(instead_of_photographs(place.path()).is_none());
         write(at("a/ply/one.ply"), HEADER).unwrap();
+        write(at("a/ply/checkpoint.pt"), b"PK\x03\x04").unwrap();
         assert_eq!(finished(place.path()), [at("a/ply/one.ply")]);
         write(at("two.ply"), HEADER).unwrap();
         write(at("three.ply"), HEADER).unwrap();
