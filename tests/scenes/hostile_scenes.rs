@@ -329,7 +329,7 @@ fn bad_matrices() {
     }
     let (folder, _) = made_up(3);
     std::fs::write(folder.path().join("poses.txt"), poses).unwrap();
-    check("no K.txt", load(folder.path()), &["K.txt", "No such file"]);
+    check("no K.txt", load(folder.path()), &["K.txt", "intrinsics beside poses.txt"]);
 }
 
 #[test]
