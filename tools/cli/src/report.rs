@@ -202,8 +202,26 @@ fn round(seconds: f64) -> f64 {
     (seconds * 1e3).round() / 1e3
 }
 
-/// Reads the largest resident set so far, bytes; `None` elsewhere than on Linux.
+/// Reads the largest resident set so far, bytes (Windows: working set); `None` on other systems than these three.
 pub fn peak_memory_bytes() -> Option<u64> {
+    peak_memory()
+}
+
+#[cfg(windows)]
+fn peak_memory() -> Option<u64> {
+    let memory = winsafe::HPROCESS::GetCurrentProcess().GetProcessMemoryInfo().ok()?;
+    u64::try_from(memory.PeakWorkingSetSize).ok()
+}
+
+#[cfg(target_os = "macos")]
+fn peak_memory() -> Option<u64> {
+    use nix::sys::resource::{UsageWho, getrusage};
+    // Bytes here, and kilobytes on other systems.
+    u64::try_from(getrusage(UsageWho::RUSAGE_SELF).ok()?.max_rss()).ok()
+}
+
+#[cfg(not(any(windows, target_os = "macos")))]
+fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
     let kib: u64 = line.split_whitespace().nth(1)?.parse().ok()?;
