@@ -19,7 +19,7 @@ if [[ ! -x $tools/bin/cargo-zigbuild ]]; then
     python3 -m venv "$tools"
     "$tools/bin/pip" install --quiet cargo-zigbuild==0.24.1 ziglang==0.17.1
 fi
-export PATH="$tools/bin:$PATH"
+export PATH="$tools/bin:$PATH" MACOSX_DEPLOYMENT_TARGET=${MACOSX_DEPLOYMENT_TARGET:-11.0}
 if ! command -v cargo-about >/dev/null; then
     say "installing cargo-about …"
     cargo install --locked --quiet --root "$tools" --features cli cargo-about@0.9.3
@@ -35,11 +35,9 @@ fi
 page=${PAGE:-$place/page}
 [[ -n ${PAGE:-} ]] || tools/web/build.sh "$page"
 
-# Programs and manual in a folder of the target's own.
+# Programs in a folder of the target's own.
 compile() {
-    local target=$1 triple=$2 features=release${FEATURES:+,$FEATURES}
-    # GPU and window load their libraries at run time, which a static program cannot.
-    [[ $triple == *musl* ]] || features+=,view
+    local target=$1 triple=$2
     say "$target, features $features …"
     rustup target list --installed 2>/dev/null | grep -qx "$triple" || rustup target add "$triple"
     # shellcheck disable=SC2086 # several words
@@ -47,11 +45,11 @@ compile() {
         --no-default-features --features "$features" ${CARGO_ARGS:-}
 }
 
-# Man pages and completions, by the first target's program that runs here.
+# Man pages and completions for these features, by the first target's program that runs here.
 manual() {
-    [[ -d $place/manual ]] && return
-    "$1" "$place/manual.part" 2>/dev/null || return 0
-    mv "$place/manual.part" "$place/manual"
+    [[ -d $pages ]] && return
+    "$1" "$pages.part" 2>/dev/null || return 0
+    mv "$pages.part" "$pages"
 }
 
 pack() {
@@ -62,7 +60,7 @@ pack() {
     cp "$built/subsplat$ending" "$built/subsplat-convert$ending" README.md LICENSE "$folder"
     cp "$licences" "$folder"
     cp -r examples/berlin "$folder/examples"
-    [[ ! -d $place/manual ]] || cp -r "$place/manual/." "$folder"
+    [[ ! -d $pages ]] || cp -r "$pages/." "$folder"
     [[ $page == no ]] || cp -r "$page" "$folder/page"
     if [[ $ending == .exe ]]; then
         (cd "$place" && python3 -m zipfile -c "$name.zip" "$name")
@@ -73,11 +71,14 @@ pack() {
     rm -rf "$folder"
 }
 
-rm -rf "$place/manual" "$place/manual.part"
+rm -rf "$place"/manual*
 for target in "${targets[@]}"; do
     triple=${target%%.[0-9]*}
-    ending=
+    ending='' features=release${FEATURES:+,$FEATURES} pages=$place/manual
     [[ $triple != *windows* ]] || ending=.exe
+    # GPU and window load their libraries at run time, which a static program cannot. For macOS they need the
+    # frameworks' link stubs, which come with Apple's SDK alone.
+    [[ $triple == *musl* || $triple == *apple* ]] || features+=,view pages+=-view
     compile "$target" "$triple"
     manual "${CARGO_TARGET_DIR:-target}/$triple/release/subsplat-manual$ending"
     pack "$triple" "$ending"
