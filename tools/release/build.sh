@@ -77,7 +77,7 @@ for target in "${targets[@]}"; do
     ending='' features=release${FEATURES:+,$FEATURES} pages=$place/manual
     [[ $triple != *windows* ]] || ending=.exe
     # GPU and window load their libraries at run time, which a static program cannot. For macOS they need the
-    # frameworks' link stubs, which come with Apple's SDK alone.
+    # frameworks' link stubs, which are part of Apple's SDK.
     [[ $triple == *musl* || $triple == *apple* ]] || features+=,view pages+=-view
     compile "$target" "$triple"
     manual "${CARGO_TARGET_DIR:-target}/$triple/release/subsplat-manual$ending"
