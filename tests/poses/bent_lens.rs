@@ -28,6 +28,10 @@ fn barrel(at: DVec2) -> DVec3 {
     at.extend(1.0 - 0.15 * at.length_squared())
 }
 
+fn pincushion(at: DVec2) -> DVec3 {
+    at.extend(1.0 + 0.12 * at.length_squared())
+}
+
 /// A fisheye lens without a circle: 127 degrees across the diagonal.
 fn full_frame_fisheye(at: DVec2) -> DVec3 {
     let theta = at.length();
@@ -83,7 +87,7 @@ fn errors(cameras: &[Option<Camera>]) -> [f64; 2] {
 
 #[test]
 fn photographs_of_a_lens_that_bends_are_straightened() {
-    for ray in [barrel, full_frame_fisheye] {
+    for (ray, sign) in [(barrel as Ray, -1.0), (full_frame_fisheye, -1.0), (pincushion, 1.0)] {
         let pictures = photographs(ray);
         let (found, loaded) = estimated(&pictures, Projection::Detected);
         let first = found.scene.frames[0].camera.rotation().as_dmat3();
@@ -94,7 +98,7 @@ fn photographs_of_a_lens_that_bends_are_straightened() {
             assert!(off < 8.0, "{off}");
         }
         let lens = found.straightened.unwrap();
-        assert!(lens.k < -0.05, "{lens:?}");
+        assert!(sign * lens.k > 0.05, "{lens:?}");
         let right = errors(&found.estimate.cameras);
         assert!(right[0] < 0.3 && right[1] < 1.5, "{right:?}");
         assert_eq!(found.estimate.confidence, Confidence::High, "{:?}", found.estimate.warnings);

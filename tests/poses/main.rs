@@ -7,3 +7,4 @@ mod many;
 mod pairs;
 mod panoramas;
 mod refused;
+mod zoom;

@@ -27,11 +27,11 @@ pub(super) const FOCAL_DEVIATION: f64 = 0.1;
 /// stereographic one has −1/4 on the plane of its own focal length.
 pub(super) const DEVIATION: f64 = 0.2;
 /// Bends of the corners that are tried, over their distance from the middle.
-const TRIED: [f64; 2] = [-0.15, -0.05];
+const TRIED: [f64; 4] = [-0.15, -0.05, 0.02, 0.06];
 /// Number of pairs on which they are tried.
 const VOTES: usize = 8;
 /// Support of a lens that bends over that of a pinhole from which on cameras are built with it.
-const SUSPECT: f64 = 1.003;
+const SUSPECT: f64 = 1.002;
 /// Matches that support it and no pinhole, from which on cameras are built with it. Pictures of pinholes gave up to 4.2.
 const SUSPECT_MATCHES: f64 = 6.0;
 /// Rounds of matching with a lens that bends.

@@ -2,7 +2,8 @@
 //!
 //! Levenberg-Marquardt steps on the robust sum of squared distances between the points' pictures
 //! and their projections. The points are eliminated (Schur complement), so that a step solves one
-//! dense system of 6 unknowns a camera and two for the lens. The first camera is kept.
+//! dense system of 6 unknowns a camera, 7 where each has a focal length of its own, and two for the lens. The first
+//! camera is kept.
 //!
 //! Source: B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000.
 
@@ -44,16 +45,21 @@ pub(super) struct Bundle {
     pub bend: f64,
     /// Standard deviation of what is known of [`Bundle::bend`], whose mean is 0; `None` keeps it.
     pub bend_prior: Option<f64>,
+    /// Logarithm of each camera's focal length over that of the first.
+    pub zooms: Vec<f64>,
+    /// Standard deviation of what is known of [`Bundle::zooms`], whose means are 0; `None` keeps them.
+    pub zoom_prior: Option<f64>,
 }
 
 /// Residual at which Cauchy's loss begins to grow slowly, standard deviations.
 const LOSS_SCALE: f64 = 2.0;
-/// Unknowns of a camera.
+/// Unknowns of a camera's pose.
 const POSE: usize = 6;
+/// The same with its focal length.
+const ZOOMED: usize = POSE + 1;
 /// Unknowns of the lens: logarithm of the focal length, bend.
 const LENS: usize = 2;
 
-type Slope = SMatrix<f64, 2, 6>;
 type PointSlope = SMatrix<f64, 2, 3>;
 
 impl Observation {
@@ -72,25 +78,50 @@ impl Observation {
     }
 }
 
-/// Normal equations of the cameras and the focal length after the elimination of the points.
-struct Reduced {
+/// Normal equations of the cameras, `N` unknowns each, and the lens after the elimination of the points.
+struct Reduced<const N: usize> {
     matrix: DMatrix<f64>,
     gradient: DVector<f64>,
     /// Inverse of each point's own block, and its gradient.
     points: Vec<(SMatrix<f64, 3, 3>, SVector<f64, 3>)>,
     /// For each observation the product of the slopes of camera and point.
-    mixed: Vec<SMatrix<f64, 6, 3>>,
+    mixed: Vec<SMatrix<f64, N, 3>>,
     /// For each point the product of the slopes of point and lens.
     lens: Vec<SMatrix<f64, 3, 2>>,
 }
 
 impl Bundle {
-    fn unknowns(&self) -> usize {
-        POSE * (self.cameras.len() - 1) + LENS
+    /// Cameras of one focal length and a lens that does not bend.
+    pub(super) fn new(
+        cameras: Vec<Absolute>,
+        points: Vec<DVec3>,
+        observations: Vec<Observation>,
+        log_focal: f64,
+        prior: Option<FocalPrior>,
+    ) -> Self {
+        let zooms = vec![0.0; cameras.len()];
+        let (bend, bend_prior, zoom_prior) = (0.0, None, None);
+        Self {
+            cameras,
+            points,
+            observations,
+            log_focal,
+            prior,
+            bend,
+            bend_prior,
+            zooms,
+            zoom_prior,
+        }
+    }
+
+    /// Number of unknowns with `N` of each camera.
+    fn unknowns<const N: usize>(&self) -> usize {
+        N * (self.cameras.len() - 1) + LENS
     }
 
     fn residual(&self, o: &Observation) -> Option<DVec2> {
-        o.residual(&self.cameras[o.camera], self.points[o.point], self.log_focal, self.bend)
+        let log_focal = self.log_focal + self.zooms[o.camera];
+        o.residual(&self.cameras[o.camera], self.points[o.point], log_focal, self.bend)
     }
 
     /// Sum of Cauchy's losses, and of the prior.
@@ -103,15 +134,24 @@ impl Bundle {
         };
         let data: f64 = self.observations.iter().map(one).sum();
         let focal = self.prior.map_or(0.0, |p| 0.5 * p.distance(self.log_focal).powi(2));
-        data + focal + self.bend_prior.map_or(0.0, |d| 0.5 * (self.bend / d).powi(2))
+        let bend = self.bend_prior.map_or(0.0, |d| 0.5 * (self.bend / d).powi(2));
+        let zoom = |d: f64| self.zooms.iter().map(|zoom| 0.5 * (zoom / d).powi(2)).sum::<f64>();
+        data + focal + bend + self.zoom_prior.map_or(0.0, zoom)
     }
 
     /// Improves all unknowns in at most `steps` steps.
     pub(super) fn adjust(&mut self, steps: usize) {
+        match self.zoom_prior {
+            None => self.adjust_all::<POSE>(steps),
+            Some(_) => self.adjust_all::<ZOOMED>(steps),
+        }
+    }
+
+    fn adjust_all<const N: usize>(&mut self, steps: usize) {
         let mut damping = 1e-4;
         let mut cost = self.cost();
         for _ in 0..steps {
-            let reduced = self.reduce(damping);
+            let reduced = self.reduce::<N>(damping);
             let next = reduced.solve().map(|step| self.moved(&reduced, &step));
             let next_cost = next.as_ref().map_or(f64::INFINITY, Self::cost);
             match next {
@@ -135,10 +175,9 @@ impl Bundle {
     }
 
     /// Builds the normal equations; `damping` is added to the diagonal in proportion.
-    fn reduce(&self, damping: f64) -> Reduced {
-        let n = self.unknowns();
+    fn reduce<const N: usize>(&self, damping: f64) -> Reduced<N> {
+        let n = self.unknowns::<N>();
         let lens_at = n - LENS;
-        let scale = self.log_focal.exp();
         // Unknowns that are kept have no slope.
         let free = SVector::<f64, LENS>::new(
             f64::from(u8::from(self.prior.is_some())),
@@ -149,21 +188,25 @@ impl Bundle {
         let mut own = vec![SMatrix::<f64, 3, 3>::zeros(); self.points.len()];
         let mut own_gradient = vec![SVector::<f64, 3>::zeros(); self.points.len()];
         let mut lens = vec![SMatrix::<f64, 3, LENS>::zeros(); self.points.len()];
-        let mut mixed = vec![SMatrix::<f64, 6, 3>::zeros(); self.observations.len()];
+        let mut mixed = vec![SMatrix::<f64, N, 3>::zeros(); self.observations.len()];
         for (o, mixed) in self.observations.iter().zip(&mut mixed) {
             let camera = &self.cameras[o.camera];
             let point = self.points[o.point];
             let Some(r) = self.residual(o) else { continue };
             let weight = 1.0 / (1.0 + r.length_squared() / (LOSS_SCALE * LOSS_SCALE));
             let p = in_view(o.view, camera.to_camera(point));
+            let scale = (self.log_focal + self.zooms[o.camera]).exp();
             let straight = p.truncate() / p.z * scale;
             let (bent, by_bend) = bend::bent_slopes(straight, self.bend);
             let bent = SMatrix::<f64, 2, 2>::from_column_slice(&bent.to_cols_array());
             let unit = scale / o.deviation;
             let rotation = converted(o.view.map_or(camera.rotation, |view| view * camera.rotation));
-            let by_camera: Slope = bent * projection_slope(camera, o.view, point) * unit;
+            let by_pose = bent * projection_slope(camera, o.view, point) * unit;
             let by_point: PointSlope = bent * slope_in_camera(p) * rotation * unit;
             let by_focal = bent * SVector::<f64, 2>::new(p.x / p.z, p.y / p.z) * unit;
+            let by_camera = SMatrix::<f64, 2, N>::from_fn(|row, column| {
+                if column < POSE { by_pose[(row, column)] } else { by_focal[row] }
+            });
             let by_bend = SVector::<f64, 2>::new(by_bend.x, by_bend.y) / o.deviation;
             let by_lens =
                 SMatrix::<f64, 2, LENS>::from_columns(&[by_focal * free[0], by_bend * free[1]]);
@@ -175,16 +218,16 @@ impl Bundle {
             block += by_lens.transpose() * by_lens * weight;
             let mut part = gradient.fixed_rows_mut::<LENS>(lens_at);
             part += by_lens.transpose() * r * weight;
-            if let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) {
+            if let Some(at) = o.camera.checked_sub(1).map(|c| c * N) {
                 *mixed = by_camera.transpose() * by_point * weight;
-                let mut block = matrix.fixed_view_mut::<6, 6>(at, at);
+                let mut block = matrix.fixed_view_mut::<N, N>(at, at);
                 block += by_camera.transpose() * by_camera * weight;
-                let mut part = gradient.fixed_rows_mut::<6>(at);
+                let mut part = gradient.fixed_rows_mut::<N>(at);
                 part += by_camera.transpose() * r * weight;
                 let cross = by_camera.transpose() * by_lens * weight;
-                let mut column = matrix.fixed_view_mut::<6, LENS>(at, lens_at);
+                let mut column = matrix.fixed_view_mut::<N, LENS>(at, lens_at);
                 column += cross;
-                let mut row = matrix.fixed_view_mut::<LENS, 6>(lens_at, at);
+                let mut row = matrix.fixed_view_mut::<LENS, N>(lens_at, at);
                 row += cross.transpose();
             }
         }
@@ -203,6 +246,13 @@ impl Bundle {
                 gradient[bend_at] += self.bend * deviation.powi(-2);
             }
         }
+        if let (ZOOMED, Some(deviation)) = (N, self.zoom_prior) {
+            for (i, zoom) in self.zooms.iter().enumerate().skip(1) {
+                let at = i * N - 1;
+                matrix[(at, at)] += deviation.powi(-2);
+                gradient[at] += zoom * deviation.powi(-2);
+            }
+        }
         (0..n).for_each(|i| matrix[(i, i)] *= 1.0 + damping);
         let points: Vec<_> = own
             .into_iter()
@@ -218,8 +268,8 @@ impl Bundle {
     }
 
     /// Subtracts what the points take up: S = U − W V⁻¹ Wᵀ.
-    fn eliminate(&self, reduced: &mut Reduced) {
-        let lens_at = self.unknowns() - LENS;
+    fn eliminate<const N: usize>(&self, reduced: &mut Reduced<N>) {
+        let lens_at = self.unknowns::<N>() - LENS;
         let Reduced { matrix, gradient, points, mixed, lens } = reduced;
         let all = self.observations.iter().zip(mixed.iter()).collect::<Vec<_>>();
         for run in all.chunk_by(|a, b| a.0.point == b.0.point) {
@@ -232,18 +282,18 @@ impl Bundle {
             let mut part = gradient.fixed_rows_mut::<LENS>(lens_at);
             part -= through.transpose() * own;
             for (o, w) in run {
-                let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) else { continue };
+                let Some(at) = o.camera.checked_sub(1).map(|c| c * N) else { continue };
                 let left = *w * inverse;
-                let mut part = gradient.fixed_rows_mut::<6>(at);
+                let mut part = gradient.fixed_rows_mut::<N>(at);
                 part -= left * own;
                 let cross = *w * through;
-                let mut column = matrix.fixed_view_mut::<6, LENS>(at, lens_at);
+                let mut column = matrix.fixed_view_mut::<N, LENS>(at, lens_at);
                 column -= cross;
-                let mut row = matrix.fixed_view_mut::<LENS, 6>(lens_at, at);
+                let mut row = matrix.fixed_view_mut::<LENS, N>(lens_at, at);
                 row -= cross.transpose();
                 for (other, v) in run {
-                    let Some(to) = other.camera.checked_sub(1).map(|c| c * POSE) else { continue };
-                    let mut block = matrix.fixed_view_mut::<6, 6>(at, to);
+                    let Some(to) = other.camera.checked_sub(1).map(|c| c * N) else { continue };
+                    let mut block = matrix.fixed_view_mut::<N, N>(at, to);
                     block -= left * v.transpose();
                 }
             }
@@ -251,12 +301,15 @@ impl Bundle {
     }
 
     /// The bundle after a step of cameras and lens; the points follow.
-    fn moved(&self, reduced: &Reduced, step: &DVector<f64>) -> Self {
+    fn moved<const N: usize>(&self, reduced: &Reduced<N>, step: &DVector<f64>) -> Self {
         let mut next = self.clone();
-        let lens_at = self.unknowns() - LENS;
+        let lens_at = self.unknowns::<N>() - LENS;
         for (i, camera) in next.cameras.iter_mut().enumerate().skip(1) {
-            let at = (i - 1) * POSE;
+            let at = (i - 1) * N;
             *camera = camera.moved(&step.as_slice()[at..at + POSE]);
+            if N > POSE {
+                next.zooms[i] += step[at + POSE];
+            }
         }
         if self.prior.is_some() {
             next.log_focal += step[lens_at];
@@ -266,8 +319,8 @@ impl Bundle {
         }
         let mut gradients: Vec<SVector<f64, 3>> = reduced.points.iter().map(|p| p.1).collect();
         for (o, w) in self.observations.iter().zip(&reduced.mixed) {
-            if let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) {
-                gradients[o.point] += w.transpose() * step.fixed_rows::<6>(at);
+            if let Some(at) = o.camera.checked_sub(1).map(|c| c * N) {
+                gradients[o.point] += w.transpose() * step.fixed_rows::<N>(at);
             }
         }
         for (i, point) in next.points.iter_mut().enumerate() {
@@ -282,15 +335,22 @@ impl Bundle {
     /// scale is that of the given points), of each rotation, radians, of the logarithm of the focal
     /// length, and of the bend. The first camera has none. `None` where the system is singular.
     pub(super) fn deviations(&self) -> Option<Deviations> {
-        let mut reduced = self.reduce(0.0);
-        let n = self.unknowns();
+        match self.zoom_prior {
+            None => self.deviations_of_all::<POSE>(),
+            Some(_) => self.deviations_of_all::<ZOOMED>(),
+        }
+    }
+
+    fn deviations_of_all<const N: usize>(&self) -> Option<Deviations> {
+        let mut reduced = self.reduce::<N>(0.0);
+        let n = self.unknowns::<N>();
         // The scale is free: its direction, translations in proportion to themselves, gets weight.
         let mut scale = DVector::<f64>::zeros(n);
         let origin = self.cameras[0].translation;
         for (i, camera) in self.cameras.iter().enumerate().skip(1) {
             let shift = camera.translation
                 - camera.rotation * self.cameras[0].rotation.transpose() * origin;
-            scale.fixed_rows_mut::<3>((i - 1) * POSE + 3).copy_from_slice(&shift.to_array());
+            scale.fixed_rows_mut::<3>((i - 1) * N + 3).copy_from_slice(&shift.to_array());
         }
         let length = scale.norm().max(1e-12);
         scale /= length;
@@ -298,7 +358,7 @@ impl Bundle {
         reduced.matrix.ger(weight, &scale, &scale, 1.0);
         let covariance = reduced.matrix.cholesky()?.inverse();
         let at = |i: usize, from: usize| {
-            (0..3).map(|k| covariance[((i - 1) * POSE + from + k, (i - 1) * POSE + from + k)]).sum()
+            (0..3).map(|k| covariance[((i - 1) * N + from + k, (i - 1) * N + from + k)]).sum()
         };
         let all = |from: usize| -> Vec<f64> {
             (0..self.cameras.len())
@@ -310,7 +370,11 @@ impl Bundle {
         };
         let focal = of_lens(0, self.prior.is_some());
         let bend = of_lens(1, self.bend_prior.is_some());
-        Some(Deviations { rotations: all(0), translations: all(3), focal, bend })
+        let zoom = |i: usize| {
+            if i == 0 || N == POSE { 0.0 } else { covariance[(i * N - 1, i * N - 1)].sqrt() }
+        };
+        let zooms = (0..self.cameras.len()).map(zoom).collect();
+        Some(Deviations { rotations: all(0), translations: all(3), focal, bend, zooms })
     }
 }
 
@@ -325,9 +389,11 @@ pub(super) struct Deviations {
     pub focal: f64,
     /// Of the bend; 0 where it is kept.
     pub bend: f64,
+    /// Of each camera's focal length over that of the first, logarithms; 0 where they are kept.
+    pub zooms: Vec<f64>,
 }
 
-impl Reduced {
+impl<const N: usize> Reduced<N> {
     fn solve(&self) -> Option<DVector<f64>> {
         let factor = self.matrix.clone().cholesky()?;
         let step = -factor.solve(&self.gradient);
@@ -372,8 +438,7 @@ mod tests {
                 observations.push(Observation { camera, point, bearing, deviation, view });
             }
         }
-        let (log_focal, prior) = (0.0, None);
-        Bundle { cameras, points, observations, log_focal, prior, bend: 0.0, bend_prior: None }
+        Bundle::new(cameras, points, observations, 0.0, None)
     }
 
     /// The same pictures through a lens that bends.
@@ -433,16 +498,17 @@ mod tests {
         let mut bundle = scene(1.1, 0.5);
         bundle.prior = Some(FocalPrior { mean: 0.1, deviation: 0.3 });
         (bundle.bend, bundle.bend_prior) = (-0.07, Some(0.2));
+        (bundle.zooms, bundle.zoom_prior) = (vec![0.0, 0.1, -0.2, 0.05, 0.0], Some(0.3));
         disturb(&mut bundle);
         bundle.observations.truncate(200);
-        let n = bundle.unknowns();
+        let n = bundle.unknowns::<ZOOMED>();
         // Points that do not move: the cameras' gradient before the elimination is that of the cost.
         let kept = bundle.clone();
-        let mut plain = bundle.reduce(0.0);
+        let mut plain = bundle.reduce::<ZOOMED>(0.0);
         for (o, w) in kept.observations.iter().zip(plain.mixed.clone()) {
-            if let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) {
+            if let Some(at) = o.camera.checked_sub(1).map(|c| c * ZOOMED) {
                 let (inverse, own) = &plain.points[o.point];
-                let mut part = plain.gradient.fixed_rows_mut::<6>(at);
+                let mut part = plain.gradient.fixed_rows_mut::<ZOOMED>(at);
                 part += w * inverse * own;
             }
         }
@@ -457,10 +523,12 @@ mod tests {
                     moved.log_focal += h;
                 } else if i == n - 1 {
                     moved.bend += h;
+                } else if i % ZOOMED == POSE {
+                    moved.zooms[1 + i / ZOOMED] += h;
                 } else {
                     let mut step = [0.0; POSE];
-                    step[i % POSE] = h;
-                    moved.cameras[1 + i / POSE] = moved.cameras[1 + i / POSE].moved(&step);
+                    step[i % ZOOMED] = h;
+                    moved.cameras[1 + i / ZOOMED] = moved.cameras[1 + i / ZOOMED].moved(&step);
                 }
                 moved.cost()
             };
@@ -487,5 +555,29 @@ mod tests {
             let errors = [&bundle, &pinhole].map(|b| off(b, &truth));
             assert!(errors[0] < 0.01 && errors[0] < 0.9 * errors[1], "{k}: {errors:?}");
         }
+    }
+
+    #[test]
+    fn focal_lengths_of_single_cameras_are_found() {
+        let mut truth = scene(1.0, 0.3);
+        let zooms = [0.0, 0.3, 0.0, -0.2, 0.05f64];
+        for o in &mut truth.observations {
+            o.bearing *= zooms[o.camera].exp();
+        }
+        let mut bundle = truth.clone();
+        bundle.prior = Some(FocalPrior { mean: 0.0, deviation: 0.3 });
+        disturb(&mut bundle);
+        let mut shared = bundle.clone();
+        shared.adjust(100);
+        bundle.zoom_prior = Some(0.3);
+        bundle.adjust(100);
+        let deviations = bundle.deviations().unwrap().zooms;
+        for (i, zoom) in zooms.iter().enumerate() {
+            let error = (bundle.zooms[i] - zoom).abs();
+            assert!(error < 4.0 * deviations[i] + 2e-3, "{i}: {error} {deviations:?}");
+            assert!(i == 0 || (1e-5..0.02).contains(&deviations[i]), "{deviations:?}");
+        }
+        let errors = [&bundle, &shared].map(|b| off(b, &truth));
+        assert!(errors[0] < 0.01 && errors[0] < 0.5 * errors[1], "{errors:?}");
     }
 }

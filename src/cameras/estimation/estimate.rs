@@ -2,19 +2,19 @@
 
 use super::absolute::Absolute;
 use super::bend;
-use super::edges::{self, Edge};
+use super::edges::Edge;
+use super::focal;
 use super::groups;
 use super::pair::{self, PairEstimate};
-use super::photo::PosePhoto;
-use super::reasons::{PoseRefusal, PoseWarning};
-use super::reconstruct::{self, Model, Point, midpoint};
-use super::refine::FocalPrior;
+use super::photo::{PosePhoto, STATED};
+use super::reasons::{PoseRefusal, PoseWarning, narrow_view};
+use super::reconstruct::{Model, Point, midpoint};
 use super::still;
 use super::tracks::FeatureId;
 use super::two_view::Bearings;
 use super::world;
+use super::zoom;
 use glam::{DMat3, DVec3, Mat4, Vec3};
-use rayon::prelude::*;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Options of [`estimate_poses`].
@@ -169,13 +169,6 @@ const RIVAL: f64 = 0.85;
 const AMBIGUOUS: f64 = 0.985;
 /// Standard deviation of the focal length's logarithm above which the poses are not certain.
 const UNCERTAIN_FOCAL: f64 = 0.12;
-/// Features that agree with a model, over those of the best one, from which on it is another answer.
-const RIVAL_MODEL: f64 = 0.85;
-/// The same of what the matches of pairs tell, above which several focal lengths are tried.
-const TOLD: f64 = 0.15;
-/// Standard deviation of the focal length's logarithm above which a photograph's file did not state
-/// it.
-const STATED: f64 = 0.1;
 /// Standard deviation of a direction above which it is not certain, degrees.
 const UNCERTAIN_DIRECTION: f64 = 1.5;
 /// Side at which shifts are reported, px.
@@ -200,9 +193,9 @@ pub fn estimate_poses(
         [a, b] => two(a, b, options),
         [] | [_] => Err(PoseRefusal::TooFew { count: photos.len() }),
         _ => match still::without_still(photos) {
-            None => many(photos, options),
+            None => many(photos, options, true),
             Some((moving, share)) => {
-                let mut estimate = many(&moving, options)?;
+                let mut estimate = many(&moving, options, true)?;
                 estimate.warnings.push(PoseWarning::StandsStill { percent: 100.0 * share });
                 Ok(estimate)
             }
@@ -284,6 +277,7 @@ fn judged(
         rotation_deviation: rotation,
         position_deviation: direction,
         bend: None,
+        bundle: None,
     };
     let mut warnings: Vec<PoseWarning> = refusal.map(PoseWarning::Forced).into_iter().collect();
     if a.lens.deviation.max(b.lens.deviation) > STATED {
@@ -405,36 +399,31 @@ fn median(mut values: Vec<f64>) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Three and more photographs.
-fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, PoseRefusal> {
+/// Three and more photographs, whose lenses may differ in their focal lengths by more than is known of them.
+fn many(
+    photos: &[PosePhoto],
+    options: &PoseOptions,
+    may_zoom: bool,
+) -> Result<PoseEstimate, PoseRefusal> {
     let deviation = photos.iter().fold(0.0f64, |m, p| m.max(p.lens.deviation));
-    let starts = if deviation > STATED {
-        starts(edges::focal_scale(photos, deviation, options.seed))
-    } else {
-        vec![1.0]
-    };
     let accepted = options.uncertain == Uncertain::Accept;
-    let sound = |photos: &[PosePhoto], e: &Edge| {
+    let is_sound = |photos: &[PosePhoto], e: &Edge| {
         accepted || refusal(&photos[e.photos[0]], &e.estimate).is_none()
     };
-    let build = |first: f64| {
-        let exact: Vec<PosePhoto> = photos.par_iter().map(|p| p.with_focal(first)).collect();
-        let edges = edges::edges(&exact, options.seed);
-        let usable: Vec<Edge> = edges.into_iter().filter(|e| sound(&exact, e)).collect();
-        let prior = (deviation > 0.0).then_some(FocalPrior { mean: -first.ln(), deviation });
-        let model = reconstruct::build(&exact, &usable, prior, options.seed)?;
-        Some(Built { first, photos: exact, edges: usable, prior, model })
-    };
-    let mut built: Vec<Built> = starts.into_iter().filter_map(build).collect();
-    // A stable order: the first of equal ones.
-    built.sort_by_key(|b| std::cmp::Reverse((b.model.placed(), b.model.agreeing())));
-    let spread = spread(&built);
-    let best = built.into_iter().next().ok_or(PoseRefusal::NoPair)?;
-    let Built { first, photos: exact, edges: usable, prior, mut model } = best;
+    let (best, spread) =
+        focal::built(photos, deviation, &is_sound, options.seed).ok_or(PoseRefusal::NoPair)?;
+    let focal::Built { first, photos: exact, edges: usable, prior, mut model } = best;
     model.focal_deviation = model.focal_deviation.max(spread);
-    let sound = |e: &Edge| sound(&exact, e);
-    let radial = options
-        .may_bend
+    let wrong = if may_zoom { focal::contradicted(photos, &is_sound, options.seed) } else { None };
+    let sound = |e: &Edge| is_sound(&exact, e);
+    let zooms = may_zoom.then(|| zoom::of_photos(&exact, &model, prior, sound, options.seed));
+    if let Some(zooms) = zooms.flatten() {
+        let zoomed: Vec<PosePhoto> = photos.iter().zip(&zooms).map(|(p, z)| p.zoomed(*z)).collect();
+        let mut estimate = many(&zoomed, options, false)?;
+        estimate.warnings.push(PoseWarning::Zoomed { percent: zoom::percent(&zooms) });
+        return Ok(estimate);
+    }
+    let radial = (options.may_bend && may_zoom)
         .then(|| bend::of_photos(&exact, &usable, &model, prior, sound, options.seed))
         .flatten()
         .map(|bend| bend.seen_from(1.0 / first));
@@ -443,9 +432,10 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
     let pairs: Vec<[usize; 2]> = usable.iter().map(|e| e.photos).collect();
     let left_out = groups::left_out(&placed, &pairs);
     let all: Vec<&PosePhoto> = photos.iter().collect();
+    let wrong = wrong.map(PoseWarning::contradicted);
     let few =
         too_few(&model, deviation).then_some(PoseWarning::FewPoints { count: model.points.len() });
-    let mut estimate = finished(&all, model, left_out, few.into_iter().collect());
+    let mut estimate = finished(&all, model, left_out, few.into_iter().chain(wrong).collect());
     // On the plane of the focal length that was found, as the definition says.
     estimate.radial = radial.map(|bend| {
         let focal_scale = bend.focal_scale;
@@ -454,43 +444,9 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
     Ok(estimate)
 }
 
-/// Cameras that were built with one focal length.
-struct Built {
-    /// Focal length at the start, over that of the lenses.
-    first: f64,
-    /// Photographs with that focal length.
-    photos: Vec<PosePhoto>,
-    /// Their pairs.
-    edges: Vec<Edge>,
-    /// Knowledge of the focal length over that at the start.
-    prior: Option<FocalPrior>,
-    /// The result.
-    model: Model,
-}
-
-/// Largest difference between the logarithms of the focal lengths of the first model and of those that the points
-/// support nearly as well.
-fn spread(built: &[Built]) -> f64 {
-    let Some(best) = built.first() else { return 0.0 };
-    let log_focal = |b: &Built| (b.first * b.model.focal_scale).ln();
-    let least = RIVAL_MODEL * best.model.agreeing() as f64;
-    let rivals = built.iter().filter(|b| b.model.agreeing() as f64 >= least);
-    rivals.map(|b| (log_focal(b) - log_focal(best)).abs()).fold(0.0, f64::max)
-}
-
 /// Returns whether a model has too few points for lenses whose focal length has the standard deviation `deviation`.
 fn too_few(model: &Model, deviation: f64) -> bool {
     deviation > STATED && model.points.len() < FEW_A_PHOTOGRAPH * model.placed()
-}
-
-/// Focal lengths with which cameras are built, over those of the lenses: one where the matches tell it, else three of
-/// which the points decide.
-fn starts(found: FocalPrior) -> Vec<f64> {
-    let FocalPrior { mean, deviation } = found;
-    if deviation < TOLD {
-        return vec![mean.exp()];
-    }
-    [0.0, -1.0, 1.0].map(|side| (mean + side * 1.2 * deviation).exp()).to_vec()
 }
 
 /// Moves a model to the world frame and writes it out.
@@ -550,23 +506,6 @@ fn finished(
         direction_error_deg: direction,
         warnings,
     }
-}
-
-/// Focal length over the longer side of a picture, above which an estimate is doubtful: 37 degrees, a lens of 54 mm.
-/// Estimates of stereo pictures side by side, of files of two fisheye lenses and of panoramas without their zenith have
-/// 1.52, 1.72 and 1.58.
-const LONG_FOCAL: f64 = 1.5;
-
-/// Warns of a focal length `scale` times the lenses' where none is stated and the result is that of a long lens.
-fn narrow_view(photos: &[&PosePhoto], scale: f64) -> Option<PoseWarning> {
-    let focal = |photo: &&PosePhoto| {
-        let k = photo.lens.intrinsics;
-        f64::from(k.fx.max(k.fy)) * scale / k.width.max(k.height) as f64
-    };
-    let unknown = photos.iter().filter(|photo| photo.lens.deviation > STATED);
-    let longest = unknown.map(focal).fold(0.0, f64::max);
-    let degrees = 2.0 * (0.5 / longest).atan().to_degrees();
-    (longest > LONG_FOCAL).then_some(PoseWarning::NarrowView { degrees })
 }
 
 /// A point with its colour, observations in px and error.

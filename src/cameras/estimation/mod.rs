@@ -6,6 +6,8 @@
 //!
 //! A panorama is a photograph of several views with one centre (`views.rs`).
 //!
+//! The focal length is one for all where the points do not tell otherwise (`focal.rs`, `zoom.rs`).
+//!
 //! Features that stand still in the picture are left out (`still.rs`). A lens that bends straight lines is found and
 //! said; the caller straightens the photographs (`bend.rs`).
 //!
@@ -24,6 +26,7 @@ mod bundle;
 mod edges;
 mod estimate;
 mod five_point;
+mod focal;
 mod groups;
 mod pair;
 mod photo;
@@ -36,6 +39,7 @@ mod tracks;
 mod two_view;
 mod views;
 mod world;
+mod zoom;
 
 pub use adjust::{CERTAIN_POINTS, PoseAdjustment, adjust_poses, locate_photos, move_along};
 pub use estimate::{

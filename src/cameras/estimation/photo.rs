@@ -18,10 +18,13 @@ use subsplat_kernels::camera::{CameraError, Intrinsics};
 const TYPICAL_FOCAL: f64 = 0.75;
 /// Standard deviation of the logarithm of an assumed focal length: lenses from 16 mm to 50 mm lie
 /// within two of them.
-const UNKNOWN_DEVIATION: f64 = 0.35;
+pub(super) const UNKNOWN_DEVIATION: f64 = 0.35;
 /// Standard deviation of the logarithm of a focal length that EXIF states: rounded to whole
 /// millimetres of the 35 mm format, and changed a little by the focus.
 const STATED_DEVIATION: f64 = 0.03;
+
+/// Standard deviation of the focal length's logarithm above which a photograph's file did not state it.
+pub(super) const STATED: f64 = 0.1;
 
 /// Lens of a photograph: a pinhole camera, and the uncertainty of its focal length.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -233,6 +236,13 @@ impl PosePhoto {
         photo.lens.deviation = 0.0;
         photo.bend *= scale * scale;
         photo.update_bearings();
+        photo
+    }
+
+    /// The same photograph with a focal length `scale` times as long, of which as much is known as before.
+    pub(super) fn zoomed(&self, scale: f64) -> Self {
+        let mut photo = self.with_focal(scale);
+        photo.lens.deviation = self.lens.deviation;
         photo
     }
 

@@ -1,5 +1,7 @@
 //! Reasons against an estimate: those that weaken it, and those for which there is none.
 
+use super::photo::{PosePhoto, STATED};
+
 /// A weakness of an estimate.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -56,6 +58,26 @@ pub enum PoseWarning {
         /// Share of the features, percent.
         percent: f64,
     },
+    /// The photographs have different focal lengths, which the points tell. Each camera has its own.
+    #[error(
+        "the focal lengths of the photographs differ by up to {percent:.0} %, as those of a zoom lens or of pictures that \
+         were cropped: each photograph has its own"
+    )]
+    Zoomed {
+        /// The longest over the shortest, less one, percent.
+        percent: f64,
+    },
+    /// The points contradict the focal length that was given.
+    #[error(
+        "the points contradict the focal length that was given: they fit one that is about {percent:.0} % {}; without \
+         --fov and --intrinsics it is estimated", if *.is_longer { "longer" } else { "shorter" }
+    )]
+    ContradictedFocal {
+        /// Difference, percent of the given one.
+        percent: f64,
+        /// The points fit a longer one.
+        is_longer: bool,
+    },
     /// The lens bends straight lines, but the straightened photographs have cameras for fewer of them.
     #[error(
         "the lens seems to bend straight lines, but photographs that were straightened fit together worse; straighten \
@@ -65,6 +87,13 @@ pub enum PoseWarning {
     /// A refusal that [`Uncertain::Accept`](super::Uncertain::Accept) overrode.
     #[error("{0}")]
     Forced(PoseRefusal),
+}
+
+impl PoseWarning {
+    /// The warning of a focal length that points fit, over the one that was given.
+    pub(super) fn contradicted(found: f64) -> Self {
+        Self::ContradictedFocal { percent: 100.0 * (found - 1.0).abs(), is_longer: found > 1.0 }
+    }
 }
 
 /// Reason for which photographs get no cameras.
@@ -133,4 +162,21 @@ pub enum PoseRefusal {
     /// No pair of photographs is wide enough to start with.
     #[error("no two of the photographs have enough in common and enough distance")]
     NoPair,
+}
+
+/// Focal length over the longer side of a picture, above which an estimate is doubtful: 37 degrees, a lens of 54 mm.
+/// Estimates of stereo pictures side by side, of files of two fisheye lenses and of panoramas without their zenith have
+/// 1.52, 1.72 and 1.58.
+const LONG_FOCAL: f64 = 1.5;
+
+/// Warns of a focal length `scale` times the lenses' where none is stated and the result is that of a long lens.
+pub(super) fn narrow_view(photos: &[&PosePhoto], scale: f64) -> Option<PoseWarning> {
+    let focal = |photo: &&PosePhoto| {
+        let k = photo.lens.intrinsics;
+        f64::from(k.fx.max(k.fy)) * scale / k.width.max(k.height) as f64
+    };
+    let unknown = photos.iter().filter(|photo| photo.lens.deviation > STATED);
+    let longest = unknown.map(focal).fold(0.0, f64::max);
+    let degrees = 2.0 * (0.5 / longest).atan().to_degrees();
+    (longest > LONG_FOCAL).then_some(PoseWarning::NarrowView { degrees })
 }

@@ -63,6 +63,8 @@ pub(super) struct Model {
     pub position_deviation: f64,
     /// The lens, where the photographs have one that bends.
     pub bend: Option<Bend>,
+    /// All of it for one more adjustment, and the photographs of its cameras.
+    pub bundle: Option<(Bundle, Vec<usize>)>,
 }
 
 impl Model {
@@ -423,9 +425,7 @@ impl<'a> Builder<'a> {
             kept.push(track);
         }
         let cameras = photos.iter().filter_map(|&i| self.cameras[i]).collect();
-        let (log_focal, prior) = (self.log_focal, self.prior);
-        let bundle =
-            Bundle { cameras, points, observations, log_focal, prior, bend: 0.0, bend_prior: None };
+        let bundle = Bundle::new(cameras, points, observations, self.log_focal, self.prior);
         (bundle, photos, kept)
     }
 
@@ -501,6 +501,7 @@ impl<'a> Builder<'a> {
             rotation_deviation: rotation,
             position_deviation: position,
             bend,
+            bundle: Some((bundle, photos)),
         }
     }
 }

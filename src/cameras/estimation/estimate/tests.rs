@@ -1,6 +1,8 @@
 //! Thresholds of refusals and warnings, each by cases 2 % below and above it. They stand here as numbers, so that a
 //! change of a constant is seen.
 
+use super::super::focal::{Built, spread, starts};
+use super::super::refine::FocalPrior;
 use super::*;
 use crate::cameras::estimation::photo::Lens;
 use crate::cameras::estimation::refine::Refined;
@@ -160,6 +162,7 @@ fn model(placed: usize, points: Vec<Point>) -> Model {
         rotation_deviation: 0.0,
         position_deviation: 0.0,
         bend: None,
+        bundle: None,
     }
 }
 
