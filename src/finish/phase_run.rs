@@ -272,10 +272,12 @@ impl<'a> PhaseRun<'a> {
 
     /// Share of the phase that is done, 0 to 1.
     pub fn progress(&self) -> f32 {
+        let of_steps = self.step as f32 / self.phase.steps.max(1) as f32;
         let part = match (self.phase.time, self.begun) {
-            (Some(time), Some(begun)) => begun.elapsed().as_secs_f32() / time.as_secs_f32(),
-            (Some(_), None) => 0.0,
-            (None, _) => self.step as f32 / self.phase.steps.max(1) as f32,
+            (Some(time), Some(begun)) => {
+                of_steps.max(begun.elapsed().as_secs_f32() / time.as_secs_f32())
+            }
+            _ => of_steps,
         };
         part.clamp(0.0, 1.0)
     }

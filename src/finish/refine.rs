@@ -75,7 +75,7 @@ pub struct RefineOptions {
     /// Each step of N photographs, three or more, leaves out this share over N of the Gaussians, a tenth at
     /// most, and others in the next step. 0 draws all. Default: 0.5.
     pub dropout: f32,
-    /// Longest duration of the steps; the rates fall over it instead of over `steps`. The result
+    /// Longest duration of the steps; the rates fall over it, or over `steps` where these end first. The result
     /// then depends on the machine. Refused where there is no clock (WebAssembly without an operating
     /// system). Default: none.
     pub time: Option<Duration>,

@@ -260,6 +260,14 @@ fn a_time_limit_ends_the_steps_and_their_rates() {
     assert!(report.steps > 0 && report.after < report.before, "{report:?}");
     // Fifteen times the limit, whatever else the machine does.
     assert!(begun.elapsed() < Duration::from_secs(30));
+    // The number of steps limits them too, and the rates then fall over it.
+    let mut options = RefineOptions::default().with_time(Duration::from_secs(3600));
+    options.steps = 12;
+    let mut limited = displaced(0.4);
+    assert_eq!(refined(&mut limited, &truth, &options).steps, 12);
+    let mut of_steps = displaced(0.4);
+    refined(&mut of_steps, &truth, &RefineOptions::default().with_steps(12));
+    assert!(limited == of_steps);
 }
 
 /// Three photographs show a surface from enough sides for colours by direction, and contradict Gaussians that

@@ -5,7 +5,7 @@
 //! subsplat-lab eval out/walk --contexts 9 --holdout 8 --upscale 2 --input-size 256
 //! ```
 //!
-//! It is the room of `examples/room` with finer textures. The camera moves 1.5 m sideways, rises and falls, and looks
+//! It is the room of `examples/room` with finer textures. The camera moves 0.8 m sideways, rises and falls, and looks
 //! at the middle of the furniture.
 
 use anyhow::{Context, Result, ensure};
@@ -24,8 +24,8 @@ const SIZE: [usize; 2] = [768, 576];
 /// Angle of view across, radians.
 const FOV: f32 = 1.15;
 /// Positions at both ends of the walk, and what the camera looks at there, m.
-const EYES: [Vec3; 2] = [Vec3::new(-0.95, -1.6, 0.55), Vec3::new(0.2, -1.66, 1.35)];
-const AIM: [Vec3; 2] = [Vec3::new(0.95, -0.62, -1.15), Vec3::new(0.75, -0.55, -1.25)];
+const EYES: [Vec3; 2] = [Vec3::new(-0.95, -1.6, 0.55), Vec3::new(-0.3, -1.64, 1.0)];
+const AIM: [Vec3; 2] = [Vec3::new(0.95, -0.62, -1.15), Vec3::new(0.83, -0.58, -1.21)];
 
 fn main() -> Result<()> {
     let mut arguments = std::env::args().skip(1);

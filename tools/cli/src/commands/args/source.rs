@@ -116,9 +116,10 @@ pub struct SourceArgs {
     /// Steps that move and reshape the splats so that new views become sharper.
     ///
     /// These steps follow those of --fit. Each step draws one photograph from the splats, and changes the
-    /// splats towards it. `off`; a number of steps; or a time, such as `20s` or `2m`. `auto`: 16 steps for two
-    /// photographs, 40 for three, 75 for four, 24 for each of more, 240 at most. The steps end early where the
-    /// photographs no longer improve. Ctrl-C ends them and keeps the scene so far. With a number or a time,
+    /// splats towards it. `off`; a number of steps; or a time, such as `20s` or `2m`, in which
+    /// each photograph has 48 steps at most: more do not improve new views. `auto`: 16 steps for two photographs,
+    /// 40 for three, 75 for four, 24 for each of more, 240 at most. The steps end early where the photographs no
+    /// longer improve. Ctrl-C ends them and keeps the scene so far. With a number or a time,
     /// `run` writes the scores of photographs that the scene is not made from, over the seconds (metrics.json).
     #[arg(
         long,
