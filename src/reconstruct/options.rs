@@ -401,7 +401,7 @@ const PHOTOGRAPHS_MAX: usize = 10;
 
 /// Most steps of [`Refine::Seconds`] for each photograph: 48 are best of 24, 48 and 96 for five photographs (see
 /// [`FACTOR_MAX`]), on the scenes that chose the constants and on the others. Seventeen photographs of `fox` as above have
-/// 29.43 dB / .867 after 24 steps each, FOX816 after 48 and 29.32 / .855 after 141, which are ten minutes.
+/// 29.43 dB / .867 after 24 steps each, 29.39 dB / .862 after 48 and 29.32 / .855 after 141, which are ten minutes.
 ///
 /// Photographs that are held out in turn do not tell the number. Of five photographs one of the inner three was left out and
 /// drawn from the four others (eight scenes, 22 runs). From 24 to 96 steps each, new views change by more than 0.1 dB in
