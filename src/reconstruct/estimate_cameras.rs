@@ -200,6 +200,27 @@ fn straight_estimate<T>(
     (first, None)
 }
 
+/// Makes the indices of photographs in `estimate` count `count` photographs, of which those of the estimate are `of_all`, and
+/// the others are `left_out`.
+fn count_among(
+    estimate: &mut PoseEstimate,
+    of_all: &[usize],
+    count: usize,
+    left_out: Vec<LeftOut>,
+) {
+    let mut cameras = vec![None; count];
+    for (&photo, camera) in of_all.iter().zip(&estimate.cameras) {
+        cameras[photo] = *camera;
+    }
+    estimate.cameras = cameras;
+    for (photo, _) in estimate.points.iter_mut().flat_map(|point| &mut point.observations) {
+        *photo = of_all[*photo];
+    }
+    estimate.left_out.iter_mut().for_each(|left| left.photo = of_all[left.photo]);
+    estimate.left_out.extend(left_out);
+    estimate.left_out.sort_by_key(|left| left.photo);
+}
+
 /// Estimates the cameras of photographs in files. `name` names the scene in messages.
 /// `photograph` is called with the index of each photograph before it is decoded.
 ///
@@ -324,7 +345,7 @@ fn estimate_scene(
     scene.warnings.extend(warnings);
     let mut lenses_of_all = vec![LensSource::Assumed; all.len()];
     of_all.iter().zip(lenses).for_each(|(&photo, lens)| lenses_of_all[photo] = lens);
-    estimate.count_among(&of_all, all.len(), left_out);
+    count_among(&mut estimate, &of_all, all.len(), left_out);
     let file = |photo: usize| all[photo].display().to_string();
     scene.warnings.extend(estimate.left_out_sentences(file));
     scene.warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));

@@ -1,7 +1,7 @@
 //! Groups of photographs: verified pairs join each photograph of a group to the others.
 //! Photographs of several scenes, or of two sides of one, fall into groups that share no points.
 
-use super::estimate::{LeftOut, PoseEstimate};
+use super::estimate::LeftOut;
 use super::tracks::root;
 
 /// Photographs of a group that has pairs with the photographs that are used: at least this many are
@@ -89,24 +89,6 @@ pub(super) fn left_out(placed: &[bool], pairs: &[[usize; 2]]) -> Vec<LeftOut> {
         }
     };
     (0..placed.len()).filter(out).map(|photo| LeftOut { photo, reason: reason(photo) }).collect()
-}
-
-impl PoseEstimate {
-    /// Makes the indices of photographs count `count` photographs, of which those of the estimate are `of_all`, and the
-    /// others are `left_out`.
-    pub(crate) fn count_among(&mut self, of_all: &[usize], count: usize, left_out: Vec<LeftOut>) {
-        let mut cameras = vec![None; count];
-        for (&photo, camera) in of_all.iter().zip(&self.cameras) {
-            cameras[photo] = *camera;
-        }
-        self.cameras = cameras;
-        for (photo, _) in self.points.iter_mut().flat_map(|point| &mut point.observations) {
-            *photo = of_all[*photo];
-        }
-        self.left_out.iter_mut().for_each(|left| left.photo = of_all[left.photo]);
-        self.left_out.extend(left_out);
-        self.left_out.sort_by_key(|left| left.photo);
-    }
 }
 
 /// One sentence, without a final full stop, for each reason of `left_out`, in the order of its first
