@@ -73,7 +73,8 @@ pub enum Confidence {
 /// A shared focal length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FocalEstimate {
-    /// Focal length over that of the photographs' lenses; 1 where it was exact.
+    /// Focal length over that of the photographs' lenses; 1 where it was exact. Where the photographs have several focal
+    /// lengths ([`PoseWarning::Zoomed`]), over that of lenses in these proportions, and each camera has its own.
     pub scale: f64,
     /// Standard deviation of its logarithm: 0.03 means three percent. At least the distance to another focal length that
     /// the points support nearly as well. 0 where it was exact.

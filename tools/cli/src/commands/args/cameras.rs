@@ -12,8 +12,9 @@ use subsplat::reconstruct::Projection;
 pub(super) const FOV_HELP: [&str; 2] = [
     "Angle of view across, degrees; replaces EXIF's",
     "Angle of view across, degrees; replaces EXIF's.\n\n\
-     It holds for all photographs. Without it, the focal length comes from EXIF, else it is estimated. The \
-     estimate from two photographs alone is often wrong.",
+     It holds for all photographs; a warning says where the points of three or more contradict it. Without it, \
+     the focal length comes from EXIF, else it is estimated, for each photograph of a zoom lens. The estimate \
+     from two photographs alone is often wrong.",
 ];
 /// Help of `--intrinsics`.
 pub(super) const INTRINSICS_HELP: &str =
