@@ -127,13 +127,13 @@ fn a_killed_run_leaves_whole_files() {
     kill(env!("CARGO_BIN_EXE_subsplat"), place.path(), &arguments, kills(6));
 }
 
-/// Ctrl-C during a refinement of a million steps: the scene so far and its pictures are written. A curve has the scores of
+/// Ctrl-C during a refinement of a hundred thousand steps: the scene so far and its pictures are written. A curve has the scores of
 /// the photograph that the scene is not made from.
 #[cfg(unix)]
 #[test]
 fn ctrl_c_keeps_the_scene_of_the_steps_so_far() {
     let place = workplace();
-    let arguments = "--json run scene --context 0,2 --target 1 --input-size 64 --refine 1000000 --save ply -o out";
+    let arguments = "--json run scene --context 0,2 --target 1 --input-size 64 --refine 100000 --save ply -o out";
     let mut command = command(env!("CARGO_BIN_EXE_subsplat"), place.path(), arguments, "");
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
