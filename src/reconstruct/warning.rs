@@ -267,13 +267,14 @@ impl Warning {
         warnings
     }
 
-    /// A line about the masks of `photos`, where they have some.
+    /// A line about the masks of `photos`, where they leave out a pixel of 200 or more. The edge of a straightened
+    /// photograph leaves out less.
     pub(super) fn of_masks(photos: &[Photo]) -> Option<Self> {
         let masks: Vec<&Mask> = photos.iter().filter_map(Photo::mask).collect();
         let pixels: usize = masks.iter().map(|mask| mask.width() * mask.height()).sum();
-        let kept: usize = masks.iter().map(|mask| mask.count()).sum();
-        let share = 1.0 - kept as f32 / pixels.max(1) as f32;
-        (!masks.is_empty()).then_some(Self::Masked { photographs: masks.len(), share })
+        let masked = pixels - masks.iter().map(|mask| mask.count()).sum::<usize>();
+        let share = masked as f32 / pixels.max(1) as f32;
+        (share >= 0.005).then_some(Self::Masked { photographs: masks.len(), share })
     }
 
     /// A warning where a quarter or more of the points of most pairs with some lies before or behind `bounds`.

@@ -63,7 +63,8 @@ impl Gpano {
         }
         let scaled = |v: [f64; 2]| [0, 1].map(|i| (v[i] * scale[i]).round() as usize);
         let (whole, at) = (scaled(whole), scaled(at));
-        let inside = at[0] + width <= whole[0] && at[1] + height <= whole[1];
+        let ends = |i: usize, side| at[i].checked_add(side).is_some_and(|end| end <= whole[i]);
+        let inside = ends(0, width) && ends(1, height);
         let pixels = (whole[0] as u64).saturating_mul(whole[1] as u64);
         let is_whole = pixels > 0 && pixels <= MAX_PIXELS && has_panorama_shape(whole[0], whole[1]);
         (inside && is_whole).then_some(Place { whole, at })
@@ -126,6 +127,7 @@ mod tests {
         assert_eq!(place(part, [60, 25]), None);
         assert_eq!(place([80, 50, 10, 4, 60, 20], [60, 20]), None);
         assert_eq!(place([80, 40, 30, 4, 60, 20], [60, 20]), None);
+        assert_eq!(place([80, 40, usize::MAX, 4, 60, 20], [60, 20]), None);
         assert_eq!(place([80, 40, 0, 0, 80, 40], [80, 40]), None);
         assert_eq!(place([80, 40, 10, 4, 0, 0], [60, 20]), None);
         let elements = "<GPano:ProjectionType>equirectangular</GPano:ProjectionType>";

@@ -296,8 +296,11 @@ fn beside(folder: &Path, photographs: &[PathBuf]) -> Option<String> {
         let files = std::fs::read_dir(below).into_iter().flatten().flatten();
         files.filter(|file| kinds.contains(&extension(&file.path()))).count()
     };
-    let counts = photograph_folders(folder).into_iter().map(|below| (count(&below), below));
-    let others: Vec<String> = counts
+    // `images/` of a folder may have the photographs.
+    let is_used = |below: &PathBuf| photographs.iter().any(|path| path.starts_with(below));
+    let unused = photograph_folders(folder).into_iter().filter(|below| !is_used(below));
+    let others: Vec<String> = unused
+        .map(|below| (count(&below), below))
         .filter(|(count, _)| *count > 0)
         .map(|(count, below)| format!("{} ({count})", below.display()))
         .collect();

@@ -120,6 +120,12 @@ fn photographs_deeper_in_a_folder_are_found_or_named() {
     assert!(note.is_some_and(|note| note.contains("more (2)")), "{}", called.stderr);
     fs::remove_dir_all(at("photos/more")).unwrap();
     assert!(!poses("photos").stderr.contains("not used"));
+    // `images` of a folder has its photographs.
+    fs::create_dir(at("album")).unwrap();
+    fs::rename(at("photos"), at("album/images")).unwrap();
+    let called = poses("album");
+    assert!(called.code == 0 && !called.stderr.contains("not used"), "{}", called.stderr);
+    fs::rename(at("album/images"), at("photos")).unwrap();
     // A scene two levels down.
     fs::create_dir_all(at("project/a/scene")).unwrap();
     fs::rename(at("photos"), at("project/a/scene/images")).unwrap();
