@@ -16,6 +16,10 @@ use crate::scene::pictures::Rgb;
 /// the properties.
 const SCALES: f64 = 0.01;
 
+/// Most pixels of the whole for each pixel of the picture: views that show so little of it are not used (`projections.rs`),
+/// and a small file may state a large whole.
+const LARGEST: u64 = 64;
+
 /// Properties of an equirectangular panorama.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Gpano {
@@ -66,7 +70,8 @@ impl Gpano {
         let ends = |i: usize, side| at[i].checked_add(side).is_some_and(|end| end <= whole[i]);
         let inside = ends(0, width) && ends(1, height);
         let pixels = (whole[0] as u64).saturating_mul(whole[1] as u64);
-        let is_whole = pixels > 0 && pixels <= MAX_PIXELS && has_panorama_shape(whole[0], whole[1]);
+        let most = MAX_PIXELS.min(LARGEST * width as u64 * height as u64);
+        let is_whole = pixels > 0 && pixels <= most && has_panorama_shape(whole[0], whole[1]);
         (inside && is_whole).then_some(Place { whole, at })
     }
 }
@@ -128,6 +133,7 @@ mod tests {
         assert_eq!(place([80, 50, 10, 4, 60, 20], [60, 20]), None);
         assert_eq!(place([80, 40, 30, 4, 60, 20], [60, 20]), None);
         assert_eq!(place([80, 40, usize::MAX, 4, 60, 20], [60, 20]), None);
+        assert_eq!(place([480, 240, 10, 4, 60, 20], [60, 20]), None);
         assert_eq!(place([80, 40, 0, 0, 80, 40], [80, 40]), None);
         assert_eq!(place([80, 40, 10, 4, 0, 0], [60, 20]), None);
         let elements = "<GPano:ProjectionType>equirectangular</GPano:ProjectionType>";
