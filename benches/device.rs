@@ -6,15 +6,15 @@
 //! the memory and counts the calls, but executes none.
 //!
 //! `--subgroups` times the kernels with two sources instead, with and without subgroup operations.
-//! `--convolutions` times convolutions of both networks: a line each for `tools/lab/gpu/torch_convolutions.py`,
-//! which adds PyTorch's time.
+//! `--convolutions` times convolutions of both networks for pictures of `--side`: a line each for
+//! `tools/lab/gpu/torch_convolutions.py`, which adds PyTorch's time.
 
 use anyhow::{Context, Result, bail, ensure};
 use candle_core::{Device, Tensor};
 use glam::{Mat4, Vec3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use subsplat::network::config::{Config, Preset};
 use subsplat::network::model::subsplat::SubSplat;
 use subsplat::network::model::weights::Weights;
@@ -160,9 +160,23 @@ fn report(name: &str, config: &Config, args: &Args) -> Result<()> {
     Ok(())
 }
 
-/// Calls of one measurement, and measurements of each device, of which the fastest counts.
+/// Calls of one measurement, and most measurements of each device, of which the fastest counts.
 const CALLS: usize = 10;
 const REPEATS: usize = 7;
+/// Time after which a kernel gets no further measurement; it has two at least, of which the first compiles it.
+const ENOUGH: Duration = Duration::from_secs(2);
+
+/// Runs `measure` as often as a kernel is measured.
+fn repeat(mut measure: impl FnMut() -> Result<()>) -> Result<()> {
+    let begun = Instant::now();
+    for i in 0..=REPEATS {
+        if i > 1 && begun.elapsed() > ENOUGH {
+            break;
+        }
+        measure()?;
+    }
+    Ok(())
+}
 
 /// A kernel on arrays of its device: gradients have the last one as the upstream gradient.
 type Call = fn(&[Array; 4]) -> Result<(), GpuError>;
@@ -207,7 +221,7 @@ fn report_subgroups() -> Result<()> {
         };
         let devices = [arrays(&with)?, arrays(&without)?];
         let mut best = [f64::INFINITY; 2];
-        for _ in 0..=REPEATS {
+        repeat(|| {
             for (arrays, best) in devices.iter().zip(&mut best) {
                 let recorder = arrays[0].recorder();
                 recorder.finish()?;
@@ -218,7 +232,8 @@ fn report_subgroups() -> Result<()> {
                 recorder.finish()?;
                 *best = best.min(start.elapsed().as_secs_f64());
             }
-        }
+            Ok(())
+        })?;
         let [own, other] = best.map(|s| 1e3 * s / CALLS as f64);
         println!("{name:22} {own:>12.3} {other:>12.3}");
     }
@@ -247,11 +262,12 @@ fn report_convolutions(args: &Args) -> Result<()> {
     let numbers = |n: usize| (0..n).map(|i| (i as f32 * 0.37).sin()).collect::<Vec<_>>();
     let upload = |dims: &[usize]| recorder.upload(&numbers(dims.iter().product()), dims);
     for [b, c, h, w, o, k, stride] in CONVOLUTIONS {
+        let [h, w] = [h, w].map(|side| side * args.side / 256);
         let (x, weight) = (upload(&[b, c, h, w])?, upload(&[o, c, k, k])?);
         let call = ConvolutionCall { stride, padding: k / 2 };
         let run = || x.convolved(&weight, None, call, PointwiseFunction::None);
         let mut best = f64::INFINITY;
-        for _ in 0..=REPEATS {
+        repeat(|| {
             recorder.finish()?;
             let start = Instant::now();
             for _ in 0..CALLS {
@@ -259,7 +275,8 @@ fn report_convolutions(args: &Args) -> Result<()> {
             }
             recorder.finish()?;
             best = best.min(start.elapsed().as_secs_f64() / CALLS as f64);
-        }
+            Ok(())
+        })?;
         let flops = 2 * b * o * c * k * k * (h / stride) * (w / stride);
         println!(
             "{b} {c} {h} {w} {o} {k} {stride} {:.4} {:.0}",

@@ -27,8 +27,8 @@ for bench in device raster; do
     if [ -n "${KIT_BENCHES:-}" ]; then
         program=$KIT_BENCHES/$bench
     else
-        program=$(cargo bench --locked --no-run --bench $bench --message-format short 2>&1 |
-            sed -n 's/.*(\(.*\))$/\1/p' | tail -1)
+        log=$(cargo bench --locked --no-run --bench $bench --message-format short 2>&1) || { echo "$log" >&2; exit 1; }
+        program=$(sed -n 's/.*(\(.*\))$/\1/p' <<<"$log" | tail -1)
     fi
     [ -f "$program" ] && strip -o "$work/bin/$bench" "$program"
 done

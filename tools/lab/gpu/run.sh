@@ -5,6 +5,7 @@
 #   KIT_DEVICE    device as of `compare --device` (default gpu)
 #   KIT_SIDE      side of the bench's pictures, px (default 256)
 #   GOLDEN        folder of MVSplat's weights and reference (default: shared/golden or ../shared/golden, if present)
+#   KIT_MARGIN    seconds at the end for the training's last step and its scores (default 20)
 #   KIT_WORKERS   threads that make training scenes (default: all but two, at least one)
 #
 # Stages: (a) every golden on the GPU, (b) the benches, beside PyTorch where it is, (c) training from the newest
@@ -79,7 +80,7 @@ for network in small mvsplat; do
     check "bench-$network" "$(share 60)" "$kit/bin/device" $network --side "$side" --device "$device"
 done
 check bench-subgroups "$(share 30)" "$kit/bin/device" --subgroups
-check bench-convolutions "$(share 40)" "$kit/bin/device" --convolutions --device "$device"
+check bench-convolutions "$(share 40)" "$kit/bin/device" --convolutions --side "$side" --device "$device"
 if python3 -c 'import torch' >/dev/null 2>&1; then
     check bench-torch "$(share 60)" sh -c \
         '"$1/torch_convolutions.py" <"$2/bench-convolutions.log"' sh "$kit" "$out"
@@ -90,14 +91,14 @@ if [ -x "$kit/bin/raster" ]; then
     check bench-raster "$(share 60)" "$kit/bin/raster" --bench --quick own
 fi
 
-# (c) Until 20 s before the end: the last checkpoint and its scores.
+# (c) Until some seconds before the end, which the last checkpoint and its scores take.
 cores=$(nproc)
 workers=${KIT_WORKERS:-$((cores > 2 ? cores - 2 : 1))}
 mkdir -p "$out/train"
 cp "$kit"/train/step-*.safetensors "$kit"/train/*.csv "$out/train/" 2>/dev/null
 sed "s/^device = .*/device = \"$device\"/; s/^workers = .*/workers = $workers/" "$kit/train/config.toml" >"$out/train/config.toml"
 limit=$(left 5)
-minutes=$(awk "BEGIN { print ($(left 20)) / 60 }")
+minutes=$(awk "BEGIN { print ($(left "${KIT_MARGIN:-20}")) / 60 }")
 check train "$limit" "$kit/bin/subsplat-lab" train "$out/train/config.toml" -o "$out/train" --minutes "$minutes"
 # The newest checkpoint alone comes back.
 ls "$out"/train/step-*.safetensors 2>/dev/null | head -n -1 | xargs -r rm
